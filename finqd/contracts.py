@@ -1,0 +1,194 @@
+"""The contracts of the eight plugin kinds: reading this file is the plugin manual.
+
+A plugin is a frozen dataclass. Its fields are its options in JSON, each with a default, a unit in the name where it
+has one (``size_mm``) and, where a range applies, ``typing.Annotated`` with a ``pydantic.Field``; its docstring's
+first line is what ``finqd plugins`` prints. It is registered under the entry-point group ``finqd.<kind>``
+and named in a design file: ``"mesher": {"name": "swept", "size_mm": 4}`` or just ``"mesher": "swept"``.
+
+Everything that passes between plugins is SI and is one of the plain data classes named here. A plugin imports
+``finqd.*`` but never another plugin.
+
+The finger frame, which geometry, meshers and actuation share: the origin lies on the inner (contact side) edge of the
+finger's base; x points away from the gripper's axis, y from the base towards the tip, z along the
+finger's thickness, with the finger symmetric about z = 0. The part of the solid in the plane y = 0 is the
+*base*: it is clamped to the gripper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from finqd.design import Design
+    from finqd.mechanics.material import Material
+    from finqd.mechanics.state import State, StepReport, System
+    from finqd.mesh import Mesh
+    from finqd.scene import Motion, Scene
+    from finqd.solid import Solid
+    from finqd.trajectory import Trajectory
+
+KINDS = ("geometry", "mesher", "elasticity", "stepper", "contact", "actuation", "fitness", "features")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One number of a finger (or of the gripper) that a design file holds and a search varies.
+
+    ``low`` to ``high`` is the search range; ``allowed_low`` to ``allowed_high`` is what a design file may hold (a value
+    outside the search range but inside the allowed one is taken with a warning). All in ``unit``; ``""`` for a count.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    allowed_low: float
+    allowed_high: float
+    integer: bool = False
+    symbol: str = ""
+    description: str = ""
+
+    @property
+    def key(self) -> str:
+        """The JSON key: the name with its unit, as in ``length_mm``."""
+        return f"{self.name}_{self.unit}" if self.unit else self.name
+
+
+class Geometry(Protocol):
+    """A finger type: declares its parameters and builds one finger's solid."""
+
+    finger_parameters: ClassVar[tuple[Parameter, ...]]
+
+    def check(self, finger: Mapping[str, float]) -> str | None:
+        """Return None, or one sentence saying which values contradict each other (``finger`` as for `build`).
+
+        The sentence names parameters by JSON key: "contact_wall_mm + back_wall_mm must stay below ...".
+        """
+
+    def build(self, finger: Mapping[str, float]) -> Solid:
+        """Return the finger's solid in the finger frame [m].
+
+        ``finger`` maps parameter names (``length``, without unit) to SI values. Raises ``InputError`` where `check`
+        would return a sentence.
+        """
+
+
+class Mesher(Protocol):
+    """Turns a solid into a volume mesh. Runs in a process of its own, which can be killed."""
+
+    def mesh(self, solid: Solid) -> Mesh:
+        """Return the mesh of ``solid``, with node set ``base`` and face set ``contact`` filled. Raises ``MeshError``."""
+
+
+class ElasticPotential(Protocol):
+    """The elastic energy of one soft body, as a function of all positions of the scene."""
+
+    #: vertex ids (scene numbering) that each element couples: one (n_elements, k) array a block
+    cliques: tuple[np.ndarray, ...]
+
+    def energy(self, positions: np.ndarray) -> float:
+        """Return the elastic energy [J]; ``positions`` [m], shape (n_vertices, 3). May be inf for an inverted element."""
+
+    def add_gradient(self, positions: np.ndarray, gradient: np.ndarray) -> float:
+        """Add dE/dpositions [N] to ``gradient``, shape (n_vertices, 3), and return the energy [J]."""
+
+    def add_hessian(
+        self, positions: np.ndarray, slots: tuple[np.ndarray, ...], blocks: np.ndarray, *, projected: bool = False
+    ) -> None:
+        """Add the Hessian [N/m] to ``blocks``, shape (n_blocks, 3, 3).
+
+        ``slots[b][e, i, j]`` is the index into ``blocks`` of the pair (node i, node j) of element e of block b
+        (see `finqd.mechanics.pattern`). ``projected``: each element's matrix is made positive semidefinite; otherwise it
+        is the exact second derivative.
+        """
+
+
+class Elasticity(Protocol):
+    """Element formulation and constitutive law."""
+
+    def potential(self, mesh: Mesh, material: Material, *, first_vertex: int = 0) -> ElasticPotential:
+        """Return the potential of a body whose vertex 0 is vertex ``first_vertex`` of the scene."""
+
+
+class ContactPotential(Protocol):
+    """All contacts and frictions of a scene, with their history. Positions and poses are those of a `State`."""
+
+    def begin_step(self, state: State, dt: float) -> None:
+        """Fix what is lagged over a step (candidates, normals, friction forces) at its start."""
+
+    def relag(self, state: State) -> float:
+        """Renew the lagged normal forces at ``state``; return the largest change of a friction bound [N]."""
+
+    def energy(self, state: State) -> float:
+        """Return contact and friction energy [J]."""
+
+    def add_derivatives(self, state: State, system: System, *, hessian: bool) -> float:
+        """Add gradient (and Hessian) to ``system``, return the energy [J]."""
+
+    def step_limit(self, state: State, direction: Any) -> float:
+        """Return the largest share (0, 1] of ``direction`` [m, rad] that no contact can tunnel through."""
+
+    def commit(self, state: State) -> None:
+        """Accept ``state`` as the end of the step: return mapping of the elastic slip, forces, penetrations."""
+
+
+class Contact(Protocol):
+    """Contact and friction model."""
+
+    def potential(self, scene: Scene) -> ContactPotential:
+        """Return the potential of every pair in the scene that can touch."""
+
+
+class Stepper(Protocol):
+    """One step in time."""
+
+    def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:
+        """Return the state ``dt`` [s] later and a report; a step that fails says so there and returns ``state`` itself."""
+
+
+class Actuation(Protocol):
+    """How the finger bases are driven."""
+
+    def motions(self, placements: Sequence[np.ndarray]) -> Sequence[Motion]:
+        """Return the closing motion of each finger base.
+
+        ``placements``: finger frame to gripper frame, one (4, 4) matrix a finger; the gripper's axis is z, up.
+        """
+
+
+class Fitness(Protocol):
+    """Turns the grasps of one design into one number and a continuous margin."""
+
+    def score(self, trajectories: Mapping[str, Trajectory]) -> FitnessResult:
+        """Return fitness in [0, 1] and per-object verdicts. A failed simulation counts as not held."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What became of one object."""
+
+    held: bool
+    drop: float  # how far the object fell relative to the gripper [m]
+    margin: float  # 1: no drop at all, 0: on the threshold, -1: lost; continuous between
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitnessResult:
+    """Fitness of a design: share of objects held, mean margin, and the verdict on each object."""
+
+    fitness: float
+    margin: float
+    verdicts: Mapping[str, Verdict]
+
+
+class Features(Protocol):
+    """Descriptors of a design for the quality-diversity map."""
+
+    names: ClassVar[tuple[str, ...]]  #: keys of what `measure` returns, with units: ``("workspace_mm2",)``
+
+    def measure(self, design: Design, solids: Sequence[Solid]) -> dict[str, float]:
+        """Return the features, in the units that their names end in."""

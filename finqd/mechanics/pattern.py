@@ -1,0 +1,63 @@
+"""Sparsity of a block matrix whose 3 x 3 blocks are pairs of vertices, with precomputed scatter maps.
+
+Format: block compressed rows (scipy's BSR) with sorted columns; both triangles are stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+
+@dataclass(frozen=True)
+class BlockPattern:
+    """Block rows: ``indptr`` (n_vertices + 1,), ``indices`` (n_blocks,): column vertex of each block, sorted in a row."""
+
+    indptr: np.ndarray
+    indices: np.ndarray
+
+    @classmethod
+    def from_cliques(cls, n_vertices: int, cliques: Sequence[np.ndarray]) -> BlockPattern:
+        """Return the pattern in which all vertices of a clique couple; each array has shape (n, k), -1 pads."""
+        keys = [np.arange(n_vertices, dtype=np.int64) * (n_vertices + 1)]
+        for nodes in cliques:
+            nodes = np.asarray(nodes, dtype=np.int64)
+            pairs = nodes[:, :, None] * n_vertices + nodes[:, None, :]
+            valid = (nodes[:, :, None] >= 0) & (nodes[:, None, :] >= 0)
+            keys.append(np.unique(pairs[valid]))
+        key = np.unique(np.concatenate(keys))
+        rows = key // n_vertices
+        indptr = np.zeros(n_vertices + 1, dtype=np.int64)
+        np.add.at(indptr, rows + 1, 1)
+        return cls(np.cumsum(indptr), key % n_vertices)
+
+    @property
+    def n_vertices(self) -> int:
+        return len(self.indptr) - 1
+
+    @property
+    def n_blocks(self) -> int:
+        return len(self.indices)
+
+    def slots(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the block index of every pair of a clique, shape (n, k, k); -1 where a node is -1.
+
+        Raises KeyError if a pair is not in the pattern.
+        """
+        nodes = np.asarray(nodes, dtype=np.int64)
+        rows = np.repeat(np.arange(self.n_vertices, dtype=np.int64), np.diff(self.indptr))
+        key = rows * self.n_vertices + self.indices
+        wanted = nodes[:, :, None] * self.n_vertices + nodes[:, None, :]
+        valid = (nodes[:, :, None] >= 0) & (nodes[:, None, :] >= 0)
+        found = np.searchsorted(key, np.where(valid, wanted, key[0]))
+        if np.any(key[np.minimum(found, len(key) - 1)][valid] != wanted[valid]):
+            raise KeyError("a pair of vertices is not in the sparsity pattern")
+        return np.where(valid, found, -1).astype(np.int32)
+
+    def matrix(self, blocks: np.ndarray) -> sp.bsr_array:
+        """Return ``blocks`` (n_blocks, 3, 3) as a sparse matrix of shape (3 n_vertices, 3 n_vertices)."""
+        n = 3 * self.n_vertices
+        return sp.bsr_array((blocks, self.indices, self.indptr), shape=(n, n))
