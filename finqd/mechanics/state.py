@@ -1,0 +1,77 @@
+"""What changes in time: positions and velocities of a scene, and what a step reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from finqd.mechanics.rotation_kernels import rotation_matrix
+
+
+@dataclass(frozen=True, kw_only=True)
+class Direction:
+    """A change of all unknowns: ``soft`` [m], shape (n_vertices, 3); ``rigid``, shape (n_rigid, 6).
+
+    A rigid row is the translation of the centre of mass [m] and the spin [rad], a rotation vector in the world frame
+    that is applied from the left.
+    """
+
+    soft: np.ndarray
+    rigid: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """A scene at one moment. Arrays are never written to after construction.
+
+    positions, velocities: soft vertices [m], [m/s], shape (n_vertices, 3)
+    rigid_positions, rigid_velocities: centres of mass [m], [m/s], shape (n_rigid, 3)
+    rigid_rotations: body frame to world, shape (n_rigid, 3, 3)
+    angular_momenta: about the centres of mass, world frame [kg m^2/s], shape (n_rigid, 3)
+    progress: share of its time that each driven motion has run, shape (n_motions,), in [0, 1]
+    """
+
+    time: float
+    positions: np.ndarray
+    velocities: np.ndarray
+    rigid_positions: np.ndarray
+    rigid_rotations: np.ndarray
+    rigid_velocities: np.ndarray
+    angular_momenta: np.ndarray
+    progress: np.ndarray
+
+    def moved(self, direction: Direction, share: float = 1.0) -> State:
+        """Return the state with positions and rotations moved by ``share`` of ``direction``."""
+        rotations = self.rigid_rotations
+        if len(rotations):
+            rotations = np.stack(
+                [rotation_matrix(share * d[3:]) @ r for d, r in zip(direction.rigid, rotations, strict=True)]
+            )
+        return replace(
+            self,
+            positions=self.positions + share * direction.soft,
+            rigid_positions=self.rigid_positions + share * direction.rigid[:, :3],
+            rigid_rotations=rotations,
+        )
+
+
+@dataclass(kw_only=True)
+class StepReport:
+    """What one attempt at a step did.
+
+    residual: largest force that is left unbalanced [N]; where: what it acts on
+    residuals: the history over the iterations [N]
+    """
+
+    converged: bool = False
+    reason: str = ""
+    iterations: int = 0
+    line_searches: int = 0
+    factorisations: int = 0
+    cg_iterations: int = 0
+    projections: int = 0
+    friction_updates: int = 0
+    residual: float = float("nan")
+    where: str = ""
+    residuals: list[float] | None = None
