@@ -6,8 +6,8 @@
     +-- MissingLibraryError   a library of this machine is missing; the sentence names what to install
     +-- MeshError             a solid could not be meshed (in time)
 
-A simulation that fails is none of these: it is data, a status and a reason in the result. A ``MeshError`` becomes such a
-result too as soon as `finqd.evaluate` sees it.
+A simulation that fails is none of these: it is data, a status and a reason in the result. A ``MeshError`` becomes such
+a result too as soon as `finqd.evaluate` sees it.
 
 >>> str(InputError("must lie in 90 to 120, got 5", where="fingers[0].length_mm"))
 'fingers[0].length_mm: must lie in 90 to 120, got 5'
@@ -23,7 +23,7 @@ class FinqdError(Exception):
 class InputError(FinqdError):
     """Something that a user wrote is wrong.
 
-    ``message``: one sentence, with the allowed values; ``where``: the place, as a JSON path or file name, printed in front.
+    ``message``: one sentence, with the allowed values; ``where``: the place, a JSON path or file name, printed first.
     """
 
     def __init__(self, message: str, where: str = "") -> None:

@@ -1,0 +1,114 @@
+"""Kind and name -> plugin, through entry points: built-ins come through the same door as anybody's.
+
+A distribution registers a plugin by naming it in its ``pyproject.toml``::
+
+    [project.entry-points."finqd.mesher"]
+    fine = "my_package:FineMesher"
+
+Only the plugin that is asked for is imported. What a plugin is, `finqd.contracts` says.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from finqd.contracts import KINDS
+from finqd.errors import FinqdError, PluginError
+from finqd.options import Option, checked_options, options_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One registered plugin: ``target`` is ``module:class``; ``distribution`` and ``version`` say who brought it."""
+
+    kind: str
+    name: str
+    distribution: str
+    version: str
+    target: str
+
+
+def entries(kind: str | None = None) -> list[Entry]:
+    """Return what is registered, of one kind or of all, sorted by kind and name; nothing is imported."""
+    kinds = KINDS if kind is None else (_known(kind),)
+    return [
+        Entry(k, ep.name, _distribution(ep), ep.dist.version if ep.dist else "?", ep.value)
+        for k in kinds
+        for ep in sorted(entry_points(group=f"finqd.{k}"), key=lambda ep: (ep.name, _distribution(ep)))
+    ]
+
+
+def names(kind: str) -> list[str]:
+    """Return the names registered under ``kind``, sorted, each once."""
+    return sorted({entry.name for entry in entries(kind)})
+
+
+def load(kind: str, name: str, *, where: str = "") -> type:
+    """Return the plugin class registered as ``name``, importing it and nothing else.
+
+    Raises ``PluginError``, with ``where`` in front: unknown (lists the known), registered by two distributions, not
+    importable, or not a dataclass (each names the distribution).
+    """
+    matches = [ep for ep in entry_points(group=f"finqd.{_known(kind, where)}") if ep.name == name]
+    if not matches:
+        raise PluginError(f"there is no {kind} plugin {name!r}; {_listed(kind)}", where)
+    if len(matches) > 1:
+        owners = " and ".join(sorted(f"{_distribution(ep)} ({ep.value})" for ep in matches))
+        raise PluginError(f"the {kind} plugin {name!r} is registered {len(matches)} times, by {owners}", where)
+    (entry_point,) = matches
+    label = f"the {kind} plugin {name!r} of the distribution {_distribution(entry_point)!r}"
+    try:
+        plugin = entry_point.load()
+    except FinqdError:
+        raise
+    except Exception as error:  # a plugin's module may raise anything at all while it is imported
+        raise PluginError(f"{label} does not import ({type(error).__name__}: {_line(error)})", where) from error
+    if not (isinstance(plugin, type) and dataclasses.is_dataclass(plugin)):
+        raise PluginError(f"{label} is not a dataclass: {entry_point.value}", where)
+    return plugin
+
+
+def create(kind: str, spec: str | Mapping[str, Any], *, where: str = "") -> Any:
+    """Return the plugin that a design file names: ``"swept"``, or ``{"name": "swept", "size_mm": 4}`` with options.
+
+    ``where``: the JSON path of ``spec``. Raises ``PluginError`` as `load` does, and for an option that is unknown, of
+    the wrong type, out of range or not finite (see `finqd.options`).
+    """
+    if isinstance(spec, str):
+        spec = {"name": spec}
+    if not isinstance(spec, Mapping) or not isinstance(spec.get("name"), str):
+        raise PluginError(f'must be the name of a {kind} plugin, or an object with its "name"; {_listed(kind)}', where)
+    name = spec["name"]
+    plugin = load(kind, name, where=where)
+    given = {key: value for key, value in spec.items() if key != "name"}
+    values = checked_options(plugin, given, label=f"{kind} {name!r}", where=where)
+    try:
+        return plugin(**values)
+    except (TypeError, ValueError) as error:  # an option without default, or what __post_init__ says of a contradiction
+        raise PluginError(f"{kind} {name!r}: {_line(error)}", where) from error
+
+
+def options(kind: str, name: str) -> list[Option]:
+    """Return the options of a plugin: name, default, unit, what is allowed (in words and as JSON schema)."""
+    return options_of(load(kind, name))
+
+
+def _known(kind: str, where: str = "") -> str:
+    if kind not in KINDS:
+        raise PluginError(f"there is no plugin kind {kind!r}; known: {', '.join(KINDS)}", where)
+    return kind
+
+
+def _listed(kind: str) -> str:
+    return f"known: {', '.join(names(kind)) or 'none'}"
+
+
+def _distribution(entry_point: EntryPoint) -> str:
+    return entry_point.dist.name if entry_point.dist else "?"
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())
