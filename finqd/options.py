@@ -1,102 +1,61 @@
-"""The options of a plugin: the fields of its dataclass, read as JSON and checked against their annotations.
+"""Checks values against annotated dataclass fields, and says in words what is allowed.
 
->>> in_words({"type": "number", "minimum": 0.5, "maximum": 20})
-'a number from 0.5 to 20'
->>> in_words({"type": "integer", "exclusiveMinimum": 0})
-'a whole number above 0'
+The options of plugins, the protocol's constants and the material are dataclasses whose fields carry their ranges
+(``Annotated[float, Ge(0)]``). Values come from JSON, where there is one kind of number and where true is not 1. Every
+refusal is one sentence with the JSON path and what is allowed.
+
+>>> from annotated_types import Ge, Le
+>>> from typing import Annotated
+>>> checked(Annotated[float, Ge(0.5), Le(20)], 4, where="mesher.size_mm")
+4.0
+>>> checked(Annotated[float, Ge(0.5), Le(20)], 40, where="mesher.size_mm")
+Traceback (most recent call last):
+finqd.errors.InputError: mesher.size_mm: must be a number from 0.5 to 20, not 40
 """
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any, get_type_hints
 
-from finqd.errors import PluginError
-from finqd.units import unit_of
-
-
-@dataclasses.dataclass(frozen=True)
-class Option:
-    """One option, in the unit that its name ends in; ``schema``: its JSON schema, ``allowed``: the same in words."""
-
-    name: str
-    default: Any
-    unit: str
-    allowed: str
-    schema: dict[str, Any]
-
-
-def options_of(plugin: type) -> list[Option]:
-    """Return the options of a plugin class, in the order of its fields."""
-    hints = _types(plugin)
-    found = []
-    for field in dataclasses.fields(plugin):
-        if field.name in hints:
-            schema = _adapter(hints[field.name]).json_schema()
-            default = None if field.default is dataclasses.MISSING else field.default
-            if field.default_factory is not dataclasses.MISSING:
-                default = field.default_factory()
-            found.append(Option(field.name, default, unit_of(field.name), in_words(schema), schema))
-    return found
-
-
-def checked_options(plugin: type, given: Mapping[str, Any], *, label: str, where: str = "") -> dict[str, Any]:
-    """Return ``given`` with each value converted to its option's type.
-
-    Values are read as JSON: a list may stand for a tuple and a whole number for a float, but true and false never for
-    numbers, and neither NaN nor inf is a number. Raises ``PluginError``, naming the place and what is allowed;
-    ``label`` names the plugin.
-    """
-    hints = _types(plugin)
-    for key in given:
-        if key not in hints:
-            raise PluginError(f"{label} has no option {key!r}; allowed: {', '.join(hints) or 'none'}", where)
-    prefix = f"{where}." if where else ""
-    return {key: _checked(hints[key], value, prefix + str(key)) for key, value in given.items()}
-
-
-def in_words(schema: Mapping[str, Any]) -> str:
-    """Return what a JSON schema allows, as in "a number from 0.5 to 20"."""
-    if "anyOf" in schema:
-        return " or ".join(in_words(part) for part in schema["anyOf"])
-    if "enum" in schema or "const" in schema:
-        values = [json.dumps(value) for value in schema.get("enum", [schema.get("const")])]
-        return "one of " + ", ".join(values) if len(values) > 1 else values[0]
-    words = _TYPES.get(str(schema.get("type", "")), "a value")
-    if "minimum" in schema and "maximum" in schema:
-        return f"{words} from {schema['minimum']:g} to {schema['maximum']:g}"
-    limits = [f"{said} {schema[key]:g}" for key, said in _LIMITS.items() if key in schema]
-    return " ".join([words, " and ".join(limits)]).strip()
-
+from finqd.errors import InputError
 
 _TYPES = {
-    "number": "a number", "integer": "a whole number", "boolean": "true or false", "string": "a text",
-    "null": "null", "array": "a list", "object": "an object",
-}
-_LIMITS = {
-    "minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below",
-    "minItems": "of at least", "maxItems": "of at most",
+    "number": "a number", "integer": "a whole number", "boolean": "true or false", "string": "a text", "null": "null",
+    "array": "a list", "object": "an object",
 }
 
 
-def _types(plugin: type) -> dict[str, Any]:
-    """Return option name -> annotated type, of the fields that the constructor takes."""
-    hints = get_type_hints(plugin, include_extras=True)
-    return {field.name: hints[field.name] for field in dataclasses.fields(plugin) if field.init}
+def option_types(owner: type) -> dict[str, Any]:
+    """Return option name -> annotated type, of the fields that the constructor of the dataclass ``owner`` takes."""
+    hints = get_type_hints(owner, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(owner) if field.init}
 
 
-def _adapter(annotation: Any) -> Any:
-    from pydantic import ConfigDict, PydanticUserError, TypeAdapter
+def option_schemas(owner: type) -> dict[str, dict[str, Any]]:
+    """Return option name -> JSON schema, with its default and, where the field's metadata has one, its description."""
+    types = option_types(owner)
+    schemas = {}
+    for field in dataclasses.fields(owner):
+        if field.name in types:
+            schemas[field.name] = {**annotation_schema(types[field.name]), **_extras(field)}
+    return schemas
 
-    try:
-        return TypeAdapter(annotation, config=ConfigDict(strict=True, allow_inf_nan=False))
-    except PydanticUserError:  # a nested dataclass brings its own configuration
-        return TypeAdapter(annotation)
+
+def annotation_schema(annotation: Any) -> dict[str, Any]:
+    """Return the JSON schema of an annotated type."""
+    return _adapter(annotation).json_schema()
 
 
-def _checked(annotation: Any, value: Any, where: str) -> Any:
+def checked(annotation: Any, value: Any, where: str = "", error_type: type[InputError] = InputError) -> Any:
+    """Return ``value`` as the annotated type. It is checked as JSON, so that a list may stand for a tuple.
+
+    Raises ``error_type``: wrong type, out of range, not finite.
+    """
     from pydantic import ValidationError
 
     adapter = _adapter(annotation)
@@ -104,6 +63,116 @@ def _checked(annotation: Any, value: Any, where: str) -> Any:
         text = json.dumps(value)
         return adapter.validate_json(text)
     except ValidationError as error:
-        raise PluginError(f"must be {in_words(adapter.json_schema())}, not {text[:60]}", where) from error
-    except (TypeError, ValueError) as error:
-        raise PluginError(f"must be {in_words(adapter.json_schema())}, not a {type(value).__name__}", where) from error
+        raise error_type(f"must be {in_words(adapter.json_schema())}, not {shown(value)}", where) from error
+    except (TypeError, ValueError, RecursionError) as error:
+        raise error_type(f"must be {in_words(adapter.json_schema())}, not a {type(value).__name__}", where) from error
+
+
+def checked_fields(owner: type, values: Any, where: str, error_type: type[InputError] = InputError) -> dict[str, Any]:
+    """Return ``values``, a JSON object, checked against the fields of the dataclass ``owner``, in the fields' order.
+
+    Raises ``error_type`` as `checked` does, and for unknown keys.
+    """
+    types = option_types(owner)
+    given = require_object(values, where, error_type)
+    refuse_unknown(given, types, where, error_type)
+    return {key: checked(types[key], given[key], join(where, key), error_type) for key in types if key in given}
+
+
+def require_object(value: Any, where: str, error_type: type[InputError] = InputError) -> Mapping[str, Any]:
+    """Return ``value`` if it is a JSON object; raise ``error_type`` otherwise."""
+    if not isinstance(value, Mapping):
+        raise error_type(f"must be an object {{...}}, not {shown(value)}", where)
+    return value
+
+
+def refuse_unknown(
+    keys: Iterable[Any], known: Iterable[str], where: str, error_type: type[InputError] = InputError
+) -> None:
+    """Raise ``error_type`` for the first of ``keys`` that is not known, with the likeliest known one."""
+    known = list(known)
+    for key in keys:
+        if key not in known:
+            near = nearest(str(key), known)
+            hint = f"did you mean {near}?" if near else f"known: {', '.join(known) or 'none'}"
+            raise error_type(f"unknown key; {hint}", join(where, key))
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word that ``word`` is most likely a misspelling of, or None.
+
+    >>> nearest("rib_cuont", ["rib_angle_deg", "rib_count"])
+    'rib_count'
+    """
+    by_lower = {other.lower(): other for other in known}
+    found = difflib.get_close_matches(word.lower()[:100], by_lower, n=1, cutoff=0.6)
+    return by_lower[found[0]] if found else None
+
+
+def join(where: str, step: Any) -> str:
+    """Return the place of a key or index below a place; a file's name ends in a colon.
+
+    >>> join(join(join("a.json:", "fingers"), 1), "rib_count")
+    'a.json: fingers[1].rib_count'
+    """
+    if isinstance(step, int) and not isinstance(step, bool):
+        return f"{where}[{step}]"
+    name = step if isinstance(step, str) and step.isidentifier() and len(step) < 60 else shown(step)
+    if not where:
+        return name
+    return f"{where} {name}" if where.endswith(":") else f"{where}.{name}"
+
+
+def shown(value: Any) -> str:
+    """Return ``value`` as short JSON on one line, for a sentence."""
+    try:
+        text = json.dumps(value)
+    except (TypeError, ValueError, RecursionError):
+        return f"a {type(value).__name__}"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def in_words(schema: Mapping[str, Any]) -> str:
+    """Return what a JSON schema allows.
+
+    >>> in_words({"type": "number", "exclusiveMinimum": 0, "maximum": 20})
+    'a number above 0 and up to 20'
+    """
+    if "anyOf" in schema:
+        return " or ".join(in_words(part) for part in schema["anyOf"])
+    if "enum" in schema or "const" in schema:
+        values = schema["enum"] if "enum" in schema else [schema["const"]]
+        return "one of " + ", ".join(json.dumps(value) for value in values) if len(values) > 1 else json.dumps(values[0])
+    words = _TYPES.get(str(schema.get("type", "")), "a value")
+    if "maxItems" in schema and schema.get("minItems") == schema["maxItems"]:
+        words += f" of {schema['maxItems']}"
+    low, above = schema.get("minimum"), schema.get("exclusiveMinimum")
+    high, below = schema.get("maximum"), schema.get("exclusiveMaximum")
+    if low is not None and high is not None:
+        return f"{words} from {low:g} to {high:g}"
+    bounds = [
+        f"of at least {low:g}" if low is not None else f"above {above:g}" if above is not None else "",
+        f"up to {high:g}" if high is not None else f"below {below:g}" if below is not None else "",
+    ]
+    return " ".join([words, " and ".join(filter(None, bounds))]).strip()
+
+
+@lru_cache(maxsize=512)
+def _adapter(annotation: Any) -> Any:
+    from pydantic import ConfigDict, PydanticUserError, TypeAdapter
+
+    try:
+        return TypeAdapter(annotation, config=ConfigDict(strict=True, allow_inf_nan=False))
+    except PydanticUserError:  # a nested dataclass or model brings its own configuration
+        return TypeAdapter(annotation)
+
+
+def _extras(field: dataclasses.Field) -> dict[str, Any]:
+    from pydantic_core import to_jsonable_python
+
+    extras = {key: field.metadata[key] for key in ("description",) if key in field.metadata}
+    if field.default is not dataclasses.MISSING:
+        extras["default"] = to_jsonable_python(field.default)
+    elif field.default_factory is not dataclasses.MISSING:
+        extras["default"] = to_jsonable_python(field.default_factory())
+    return extras

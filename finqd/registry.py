@@ -17,7 +17,8 @@ from typing import Any
 
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, PluginError
-from finqd.options import Option, checked_options, options_of
+from finqd.options import checked, in_words, join, option_schemas, option_types
+from finqd.units import unit_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +30,17 @@ class Entry:
     distribution: str
     version: str
     target: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """One option of a plugin, in the unit that its name ends in; ``schema``: its JSON schema, ``allowed``: in words."""
+
+    name: str
+    unit: str
+    default: Any
+    allowed: str
+    schema: dict[str, Any]
 
 
 def entries(kind: str | None = None) -> list[Entry]:
@@ -83,8 +95,12 @@ def create(kind: str, spec: str | Mapping[str, Any], *, where: str = "") -> Any:
         raise PluginError(f'must be the name of a {kind} plugin, or an object with its "name"; {_listed(kind)}', where)
     name = spec["name"]
     plugin = load(kind, name, where=where)
-    given = {key: value for key, value in spec.items() if key != "name"}
-    values = checked_options(plugin, given, label=f"{kind} {name!r}", where=where)
+    types, values = option_types(plugin), {}
+    for key, value in spec.items():
+        if key in types:
+            values[key] = checked(types[key], value, join(where, key), PluginError)
+        elif key != "name":
+            raise PluginError(f"{kind} {name!r} has no option {key!r}; allowed: {', '.join(types) or 'none'}", where)
     try:
         return plugin(**values)
     except (TypeError, ValueError) as error:  # an option without default, or what __post_init__ says of a contradiction
@@ -92,8 +108,9 @@ def create(kind: str, spec: str | Mapping[str, Any], *, where: str = "") -> Any:
 
 
 def options(kind: str, name: str) -> list[Option]:
-    """Return the options of a plugin: name, default, unit, what is allowed (in words and as JSON schema)."""
-    return options_of(load(kind, name))
+    """Return the options of a plugin, in the order of its fields."""
+    schemas = option_schemas(load(kind, name))
+    return [Option(key, unit_of(key), schema.get("default"), in_words(schema), schema) for key, schema in schemas.items()]
 
 
 def _known(kind: str, where: str = "") -> str:
