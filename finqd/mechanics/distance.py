@@ -1,0 +1,163 @@
+"""Makes the `DistanceField` of a sphere, of a solid of revolution and of a closed triangle surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, SURFACE, DistanceField
+
+LEAF_SIZE = 4  # triangles a leaf of the tree holds at most; 3 to 6 measure alike
+
+
+def sphere_field(radius: float) -> DistanceField:
+    """Return the field of a sphere of ``radius`` [m] about the origin."""
+    return _field(kind=SPHERE, radius=float(radius))
+
+
+def revolution_field(profile: np.ndarray) -> DistanceField:
+    """Return the field of a solid of revolution about z.
+
+    profile: closed polygon (r, z) [m] with r >= 0, shape (n, 2), counterclockwise, not repeating its first point. Edges
+    on the axis lie inside the solid and are left out; a profile that stays off the axis makes a ring or a tube.
+    """
+    start = np.asarray(profile, dtype=float)
+    edge = np.roll(start, -1, axis=0) - start
+    length = np.hypot(edge[:, 0], edge[:, 1])
+    normal = np.column_stack([edge[:, 1], -edge[:, 0]]) / length[:, None]
+    on_axis = (start[:, 0] == 0.0) & (edge[:, 0] == 0.0)
+    mirrored = np.where(on_axis[:, None], 0.0, normal)  # an axis edge says nothing about the surface
+    at_start = mirrored + np.roll(mirrored, 1, axis=0)
+    at_start[start[:, 0] == 0.0, 0] = 0.0  # an apex: its pseudonormal is along the axis
+    at_start /= np.maximum(np.hypot(at_start[:, 0], at_start[:, 1]), 1e-300)[:, None]
+    at_end = np.roll(at_start, -1, axis=0)
+    segments = np.column_stack([start, edge, length**-2.0, normal])[~on_axis]
+    ends = np.stack([at_start, at_end], axis=1)[~on_axis]
+    return _field(kind=REVOLUTION, segments=segments, segment_normals=ends)
+
+
+def surface_field(vertices: np.ndarray, triangles: np.ndarray) -> DistanceField:
+    """Return the field of a watertight, outward oriented triangle surface.
+
+    vertices: [m], shape (n, 3); triangles: shape (m, 3), every edge shared by exactly two of them (else ValueError),
+    none of zero area.
+    """
+    vertices = np.asarray(vertices, dtype=float)
+    triangles = np.asarray(triangles, dtype=np.int64)
+    normals = triangle_normals(vertices, triangles)
+    edge_of, edge_normals = _edge_normals(triangles, normals)
+    pseudonormals = _unit(np.concatenate([edge_normals, _vertex_normals(vertices, triangles, normals)]))
+    features = np.concatenate([edge_of, triangles + len(edge_normals)], axis=1)
+    corners = vertices[triangles]
+    order, leaf_size = _leaf_order(corners.mean(axis=1))
+    corners = corners[order]
+    return _field(
+        kind=SURFACE,
+        corners=corners,
+        normals=normals[order],
+        features=features[order],
+        pseudonormals=pseudonormals,
+        boxes=_tree_boxes(corners, leaf_size),
+        leaf_size=leaf_size,
+    )
+
+
+def triangle_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return unit normals of ``triangles``, shape (m, 3)."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    return _unit(np.cross(b - a, c - a))
+
+
+def edge_table(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return edges and who shares them: (edges (n, 2), edge_of (m, 3), counts (n,)).
+
+    edge_of: row of ``edges`` for the edges ab, bc, ca of each triangle.
+    """
+    sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+    ends = np.sort(sides.astype(np.int64), axis=1)
+    n = int(triangles.max()) + 1
+    keys, edge_of, counts = np.unique(ends[:, 0] * n + ends[:, 1], return_inverse=True, return_counts=True)
+    return np.column_stack([keys // n, keys % n]), edge_of.reshape(-1, 3), counts
+
+
+def _field(**given) -> DistanceField:
+    """Fill what is not given with empty arrays, and fix types and memory order: one Numba type for all shapes."""
+    shapes = {
+        "segments": (0, 7), "segment_normals": (0, 2, 2), "corners": (0, 3, 3), "normals": (0, 3),
+        "features": (0, 6), "pseudonormals": (0, 3), "boxes": (0, 6),
+    }  # fmt: skip
+    arrays = {
+        name: np.ascontiguousarray(given.get(name, np.zeros(shape)), dtype="i4" if name == "features" else "f8")
+        for name, shape in shapes.items()
+    }
+    kind, radius, leaf_size = given["kind"], given.get("radius", 0.0), given.get("leaf_size", 0)
+    return DistanceField(kind=kind, radius=radius, leaf_size=leaf_size, **arrays)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Return ``vectors`` at length 1 (a zero vector stays zero)."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None]
+
+
+def _edge_normals(triangles: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edge of each triangle side, shape (m, 3), and the sum of both triangle normals at each edge."""
+    edges, edge_of, counts = edge_table(triangles)
+    if np.any(counts != 2):
+        raise ValueError(f"{np.count_nonzero(counts != 2)} edges are not shared by exactly two triangles")
+    sums = np.zeros((len(edges), 3))
+    for side in range(3):
+        for axis in range(3):
+            sums[:, axis] += np.bincount(edge_of[:, side], weights=normals[:, axis], minlength=len(edges))
+    return edge_of, sums
+
+
+def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the sum of triangle normals at each vertex, weighted by the angle each triangle has there."""
+    angles = corner_angles(vertices, triangles)
+    sums = np.zeros((len(vertices), 3))
+    for corner in range(3):
+        for axis in range(3):
+            weights = angles[:, corner] * normals[:, axis]
+            sums[:, axis] += np.bincount(triangles[:, corner], weights=weights, minlength=len(vertices))
+    return sums
+
+
+def corner_angles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the angle [rad] of each triangle at each of its corners, shape (m, 3)."""
+    points = vertices[triangles]
+    to_next = np.roll(points, -1, axis=1) - points
+    to_last = np.roll(points, 1, axis=1) - points
+    sine = np.linalg.norm(np.cross(to_next, to_last), axis=2)
+    return np.arctan2(sine, np.einsum("ijk,ijk->ij", to_next, to_last))
+
+
+def _leaf_order(centres: np.ndarray) -> tuple[np.ndarray, int]:
+    """Order triangles so that equal runs of them are compact: halve at the median of the longest axis, level by level.
+
+    Returns (order, leaf_size). The last triangles repeat until all leaves are full, so that levels are plain reshapes.
+    """
+    n = len(centres)
+    n_levels = max(0, int(np.ceil(np.log2(n / LEAF_SIZE))))
+    leaf_size = -(-n // 2**n_levels)
+    order = np.minimum(np.arange(leaf_size * 2**n_levels), n - 1)[None, :]
+    for _ in range(n_levels):
+        points = centres[order]
+        axis = np.argmax(points.max(axis=1) - points.min(axis=1), axis=1)
+        keys = np.take_along_axis(points, axis[:, None, None], axis=2)[:, :, 0]
+        half = order.shape[1] // 2
+        order = np.take_along_axis(order, np.argpartition(keys, half - 1, axis=1), axis=1).reshape(-1, half)
+    return order.reshape(-1), leaf_size
+
+
+def _tree_boxes(corners: np.ndarray, leaf_size: int) -> np.ndarray:
+    """Return the boxes of a complete binary tree over runs of ``leaf_size`` triangles, shape (2 n_leaves, 6)."""
+    n_leaves = len(corners) // leaf_size
+    boxes = np.zeros((2 * n_leaves, 6))
+    runs = corners.reshape(n_leaves, -1, 3)
+    boxes[n_leaves:, :3], boxes[n_leaves:, 3:] = runs.min(axis=1), runs.max(axis=1)
+    first = n_leaves // 2
+    while first >= 1:
+        children = boxes[2 * first : 4 * first].reshape(first, 2, 6)
+        boxes[first : 2 * first, :3] = children[:, :, :3].min(axis=1)
+        boxes[first : 2 * first, 3:] = children[:, :, 3:].max(axis=1)
+        first //= 2
+    return boxes
