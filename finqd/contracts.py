@@ -25,7 +25,9 @@ import numpy as np
 if TYPE_CHECKING:
     from finqd.design import Design
     from finqd.mechanics.material import Material
-    from finqd.mechanics.state import State, StepReport, System
+    from finqd.mechanics.pattern import BlockPattern
+    from finqd.mechanics.state import Direction, State, StepReport
+    from finqd.mechanics.system import Derivatives, System
     from finqd.mesh import Mesh
     from finqd.scene import Motion, Scene
     from finqd.solid import Solid
@@ -115,22 +117,35 @@ class Elasticity(Protocol):
 
 
 class ContactPotential(Protocol):
-    """All contacts and frictions of a scene, with their history. Positions and poses are those of a `State`."""
+    """All contacts and frictions of a scene, with their history. Positions and poses are those of a `State`.
 
-    def begin_step(self, state: State, dt: float) -> None:
-        """Fix what is lagged over a step (candidates, normals, friction forces) at its start."""
+    soft_forces: normal force on each soft body at the last committed state [N], shape (n_soft,)
+    penetration: largest at the last committed state [m]
+    """
+
+    soft_forces: np.ndarray
+    penetration: float
+
+    def bind(self, pattern: BlockPattern) -> None:
+        """Look up where in the Hessian's blocks the contacts go."""
+
+    def begin_step(self, state: State) -> None:
+        """Fix what is lagged over a step (reference points, normals, friction bounds) at its start."""
 
     def relag(self, state: State) -> float:
-        """Renew the lagged normal forces at ``state``; return the largest change of a friction bound [N]."""
+        """Renew the friction bounds at ``state``; return the largest change [N]."""
 
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J]."""
 
-    def add_derivatives(self, state: State, system: System, *, hessian: bool) -> float:
-        """Add gradient (and Hessian) to ``system``, return the energy [J]."""
+    def add_derivatives(self, state: State, derivatives: Derivatives, *, hessian: bool) -> float:
+        """Add gradient (and a positive semidefinite Hessian) to ``derivatives``, return the energy [J].
 
-    def step_limit(self, state: State, direction: Any) -> float:
-        """Return the largest share (0, 1] of ``direction`` [m, rad] that no contact can tunnel through."""
+        Coulomb friction has no potential: its bounds are lagged, and at fixed bounds it is one.
+        """
+
+    def step_limit(self, state: State, direction: Direction) -> float:
+        """Return the largest share (0, 1] of ``direction`` in which no contact can tunnel through."""
 
     def commit(self, state: State) -> None:
         """Accept ``state`` as the end of the step: return mapping of the elastic slip, forces, penetrations."""

@@ -1,0 +1,534 @@
+"""Kernels of penalty contact with Coulomb friction between soft faces, rigid bodies and planes.
+
+A *contact* is a row: a point of a soft face (``face``, shape weights ``weight``; face = -1 if no soft body takes
+part) against a rigid body (``rigid``; -1 if a fixed plane) with signed ``gap`` [m], unit ``normal`` from the rigid
+towards the soft side (from the plane's side away from the body for a body on a plane), ``arm`` = contact point minus
+centre of mass [m], and ``stiffness`` [N/m].
+
+Relative displacement of a contact: w = sum_a weight_a dx_a - dc - dphi x arm, so dgap = normal . w.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from finqd.mechanics.distance_kernels import signed_distance
+
+
+@njit(cache=True)
+def normal_energy(gap, stiffness, smoothing):
+    r"""Return the penalty energy [J] of one contact.
+
+    With p = -gap [m], k the stiffness [N/m] and s the smoothing length [m]: 0 for p <= 0; k p^3/(6 s) up to s; beyond,
+    k (p^2/2 - p s/2 + s^2/6). Twice continuously differentiable; the force tends to k (p - s/2).
+    """
+    p = -gap
+    if p <= 0.0:
+        return 0.0
+    if p < smoothing:
+        return stiffness * p * p * p / (6.0 * smoothing)
+    return stiffness * (0.5 * p * p - 0.5 * p * smoothing + smoothing * smoothing / 6.0)
+
+
+@njit(cache=True)
+def normal_force(gap, stiffness, smoothing):
+    """Return the force [N] (>= 0) and its derivative with the penetration [N/m]; see `normal_energy`."""
+    p = -gap
+    if p <= 0.0:
+        return 0.0, 0.0
+    if p < smoothing:
+        return stiffness * p * p / (2.0 * smoothing), stiffness * p / smoothing
+    return stiffness * (p - 0.5 * smoothing), stiffness
+
+
+@njit(cache=True)
+def face_point(positions, nodes, weight, point):
+    """Write sum_a weight_a positions[nodes_a] to ``point``; nodes of -1 are skipped."""
+    point[0] = point[1] = point[2] = 0.0
+    for a in range(nodes.shape[0]):
+        n = nodes[a]
+        if n >= 0:
+            for i in range(3):
+                point[i] += weight[a] * positions[n, i]
+
+
+@njit(cache=True)
+def find_soft_rigid(
+    positions, faces, sample_face, sample_weight, sample_stiffness, centre, rotation, field, low, high,
+    rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+):
+    """Append the samples of soft faces that lie inside a rigid body; return the new count.
+
+    low, high: bounding box of the body in its own frame [m], shape (3,).
+    """
+    x, y = np.empty(3), np.empty(3)
+    for s in range(sample_face.shape[0]):
+        f = sample_face[s]
+        face_point(positions, faces[f], sample_weight[s], x)
+        inside = True
+        for i in range(3):
+            y[i] = 0.0
+            for j in range(3):
+                y[i] += rotation[j, i] * (x[j] - centre[j])
+            if y[i] < low[i] or y[i] > high[i]:
+                inside = False
+                break
+        if not inside:
+            continue
+        d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
+        if d >= 0.0:
+            continue
+        out_key[count] = first_key + s
+        out_face[count] = f
+        out_weight[count] = sample_weight[s]
+        out_gap[count] = d
+        for i in range(3):
+            out_normal[count, i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
+            out_arm[count, i] = x[i] - centre[i]
+        out_stiffness[count] = sample_stiffness[s]
+        out_rigid[count] = rigid
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def find_soft_plane(
+    positions, faces, sample_face, sample_weight, sample_stiffness, point, normal, first_key,
+    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+):
+    """Append the samples of soft faces below a plane; return the new count."""
+    x = np.empty(3)
+    for s in range(sample_face.shape[0]):
+        f = sample_face[s]
+        face_point(positions, faces[f], sample_weight[s], x)
+        d = 0.0
+        for i in range(3):
+            d += normal[i] * (x[i] - point[i])
+        if d >= 0.0:
+            continue
+        out_key[count] = first_key + s
+        out_face[count] = f
+        out_weight[count] = sample_weight[s]
+        out_gap[count] = d
+        out_normal[count] = normal
+        out_arm[count] = 0.0
+        out_stiffness[count] = sample_stiffness[s]
+        out_rigid[count] = -1
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def find_rigid_plane(
+    points, ball_radius, centre, rotation, point, normal, stiffness, rigid, first_key,
+    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+):
+    """Append the support points of a rigid body below a plane; return the new count.
+
+    points: in the body frame [m], shape (n, 3); a ball (``ball_radius`` > 0) touches with its lowest point instead.
+    The reported normal is minus the plane's, since the body is on the rigid side of the row.
+    """
+    arm = np.empty(3)
+    n = 1 if ball_radius > 0.0 else points.shape[0]
+    for s in range(n):
+        d = 0.0
+        for i in range(3):
+            if ball_radius > 0.0:
+                arm[i] = -ball_radius * normal[i]
+            else:
+                arm[i] = rotation[i, 0] * points[s, 0] + rotation[i, 1] * points[s, 1] + rotation[i, 2] * points[s, 2]
+            d += normal[i] * (centre[i] + arm[i] - point[i])
+        if d >= 0.0:
+            continue
+        out_key[count] = first_key + s
+        out_face[count] = -1
+        out_weight[count] = 0.0
+        out_gap[count] = d
+        out_normal[count] = -normal
+        out_arm[count] = arm
+        out_stiffness[count] = stiffness
+        out_rigid[count] = rigid
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def closest_on_triangle(p, a, b, c, bary):
+    """Write barycentric coordinates of the point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 5.1.5)."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
+    bary[0], bary[1], bary[2] = 1.0, 0.0, 0.0
+    if d1 <= 0.0 and d2 <= 0.0:
+        return
+    bp = p - b
+    d3, d4 = np.dot(ab, bp), np.dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        bary[0], bary[1] = 0.0, 1.0
+        return
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        bary[1] = d1 / (d1 - d3)
+        bary[0] = 1.0 - bary[1]
+        return
+    cp = p - c
+    d5, d6 = np.dot(ab, cp), np.dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        bary[0], bary[2] = 0.0, 1.0
+        return
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        bary[2] = d2 / (d2 - d6)
+        bary[0] = 1.0 - bary[2]
+        return
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        bary[0] = 0.0
+        bary[2] = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        bary[1] = 1.0 - bary[2]
+        return
+    total = va + vb + vc
+    bary[1], bary[2] = vb / total, vc / total
+    bary[0] = 1.0 - bary[1] - bary[2]
+
+
+@njit(cache=True)
+def near_triangles(positions, faces, triangle_face, points, reach, low, high, pairs):
+    """Write the (point, triangle) pairs whose face box, grown by ``reach`` [m], holds the point; return their number.
+
+    low, high: scratch for the face boxes, shape (n_faces, 3). pairs: shape (n, 2); if it is too small, the number
+    returned is larger than n. A sweep over the points sorted along x keeps it near linear.
+    """
+    lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
+    for q in range(points.shape[0]):
+        for i in range(3):
+            lower[i] = min(lower[i], points[q, i] - reach)
+            upper[i] = max(upper[i], points[q, i] + reach)
+    order = np.argsort(points[:, 0])
+    sorted_x = points[order, 0]
+    count = 0
+    for f in range(faces.shape[0]):
+        for i in range(3):
+            low[f, i], high[f, i] = np.inf, -np.inf
+        for a in range(faces.shape[1]):
+            n = faces[f, a]
+            if n >= 0:
+                for i in range(3):
+                    low[f, i] = min(low[f, i], positions[n, i] - reach)
+                    high[f, i] = max(high[f, i], positions[n, i] + reach)
+    for t in range(triangle_face.shape[0]):
+        f = triangle_face[t]
+        apart = False
+        for i in range(3):
+            if low[f, i] > upper[i] or high[f, i] < lower[i]:
+                apart = True
+        if apart:
+            continue
+        k = np.searchsorted(sorted_x, low[f, 0])
+        while k < points.shape[0] and sorted_x[k] <= high[f, 0]:
+            q = order[k]
+            k += 1
+            if low[f, 1] <= points[q, 1] <= high[f, 1] and low[f, 2] <= points[q, 2] <= high[f, 2]:
+                if count < pairs.shape[0]:
+                    pairs[count, 0], pairs[count, 1] = q, t
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def find_feature_soft(
+    positions, faces, triangle_face, triangle_weight, pairs, points, feature_stiffness, centre, rotation, rigid,
+    first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+):
+    """Append the features of a rigid body that lie inside a soft body; return the new count.
+
+    pairs: candidate (point, triangle) sorted by point, then soft body; shape (n, 3): point, triangle, soft body. The
+    gap of a point to a body is the signed distance to the nearest triangle; where several are equally near (an edge),
+    the one that faces the point most decides the sign.
+    """
+    p, arm, bary, corner, cp, best_n = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
+    i0 = 0
+    while i0 < pairs.shape[0]:
+        i1 = i0
+        while i1 < pairs.shape[0] and pairs[i1, 0] == pairs[i0, 0] and pairs[i1, 2] == pairs[i0, 2]:
+            i1 += 1
+        q = pairs[i0, 0]
+        for i in range(3):
+            arm[i] = rotation[i, 0] * points[q, 0] + rotation[i, 1] * points[q, 1] + rotation[i, 2] * points[q, 2]
+            p[i] = centre[i] + arm[i]
+        best, best_facing, best_t, best_gap = np.inf, -1.0, -1, 0.0
+        for c in range(i0, i1):
+            t = pairs[c, 1]
+            nodes = faces[triangle_face[t]]
+            for v in range(3):
+                face_point(positions, nodes, triangle_weight[t, v], corner[v])
+            closest_on_triangle(p, corner[0], corner[1], corner[2], bary)
+            for i in range(3):
+                cp[i] = bary[0] * corner[0, i] + bary[1] * corner[1, i] + bary[2] * corner[2, i]
+            delta = p - cp
+            distance = math.sqrt(np.dot(delta, delta))
+            n = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+            n /= max(math.sqrt(np.dot(n, n)), 1e-300)
+            height = np.dot(delta, n)
+            facing = abs(height) / distance if distance > 1e-12 else 1.0
+            if distance < best - 1e-9 or (distance < best + 1e-9 and facing > best_facing):
+                best, best_facing, best_t = distance, facing, t
+                best_gap = distance if height > 0.0 else -distance
+                if count < out_key.shape[0]:
+                    # weights of the closest point on the face, through the triangle's corners
+                    for a in range(nodes.shape[0]):
+                        out_weight[count, a] = (
+                            bary[0] * triangle_weight[t, 0, a] + bary[1] * triangle_weight[t, 1, a]
+                            + bary[2] * triangle_weight[t, 2, a]
+                        )
+                if facing > 0.999999:
+                    best_n[:] = n
+                else:
+                    best_n[:] = delta / best_gap
+        if best_gap < 0.0:
+            out_key[count] = first_key + q
+            out_face[count] = triangle_face[best_t]
+            out_gap[count] = best_gap
+            out_normal[count] = -best_n
+            out_arm[count] = arm
+            out_stiffness[count] = feature_stiffness[q]
+            out_rigid[count] = rigid
+            count += 1
+        i0 = i1
+    return count
+
+
+@njit(cache=True)
+def normal_contacts_energy(gap, stiffness, smoothing, count):
+    """Return the summed penalty energy [J]."""
+    energy = 0.0
+    for c in range(count):
+        energy += normal_energy(gap[c], stiffness[c], smoothing)
+    return energy
+
+
+@njit(cache=True)
+def _add_row(
+    faces, face_slots, face, weight, rigid, spin, force, matrix, gradient, rigid_gradient,
+    blocks, coupling, rigid_matrix, want_hessian,
+):
+    """Add the force -> gradient and the 3 x 3 ``matrix`` -> Hessian of one contact.
+
+    The relative displacement depends on the rigid unknowns through ``spin``: w = ... - dc + spin dphi.
+    ``force`` is dE/dw, shape (3,).
+    """
+    k = faces.shape[1]
+    if face >= 0:
+        for a in range(k):
+            n = faces[face, a]
+            if n >= 0:
+                for i in range(3):
+                    gradient[n, i] += weight[a] * force[i]
+    if rigid >= 0:
+        for i in range(3):
+            rigid_gradient[rigid, i] -= force[i]
+            for j in range(3):
+                rigid_gradient[rigid, 3 + i] += spin[j, i] * force[j]
+    if not want_hessian:
+        return
+    if face >= 0:
+        for a in range(k):
+            for b in range(k):
+                slot = face_slots[face, a, b]
+                if slot >= 0:
+                    ww = weight[a] * weight[b]
+                    for i in range(3):
+                        for j in range(3):
+                            blocks[slot, i, j] += ww * matrix[i, j]
+    if rigid < 0:
+        return
+    ms = matrix @ spin
+    sms = spin.T @ ms
+    r0 = 6 * rigid
+    for i in range(3):
+        for j in range(3):
+            rigid_matrix[r0 + i, r0 + j] += matrix[i, j]
+            rigid_matrix[r0 + i, r0 + 3 + j] -= ms[i, j]
+            rigid_matrix[r0 + 3 + j, r0 + i] -= ms[i, j]
+            rigid_matrix[r0 + 3 + i, r0 + 3 + j] += sms[i, j]
+    if face >= 0:
+        for a in range(k):
+            n = faces[face, a]
+            if n >= 0:
+                for i in range(3):
+                    for j in range(3):
+                        coupling[3 * n + i, r0 + j] -= weight[a] * matrix[i, j]
+                        coupling[3 * n + i, r0 + 3 + j] += weight[a] * ms[i, j]
+
+
+@njit(cache=True)
+def add_normal(
+    faces, face_slots, face, weight, gap, normal, arm, stiffness, rigid, count, smoothing,
+    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_hessian,
+):
+    """Add gradient and (Gauss-Newton, so positive semidefinite) Hessian of the penalty; return the energy [J]."""
+    energy = 0.0
+    spin, matrix, force = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
+    for c in range(count):
+        energy += normal_energy(gap[c], stiffness[c], smoothing)
+        f, df = normal_force(gap[c], stiffness[c], smoothing)
+        for i in range(3):
+            force[i] = -f * normal[c, i]
+            for j in range(3):
+                matrix[i, j] = df * normal[c, i] * normal[c, j]
+        # -dphi x arm = [arm] dphi
+        spin[0, 0] = spin[1, 1] = spin[2, 2] = 0.0
+        spin[0, 1], spin[0, 2] = -arm[c, 2], arm[c, 1]
+        spin[1, 0], spin[1, 2] = arm[c, 2], -arm[c, 0]
+        spin[2, 0], spin[2, 1] = -arm[c, 1], arm[c, 0]
+        _add_row(
+            faces, face_slots, face[c], weight[c], rigid[c], spin, force, matrix, gradient, rigid_gradient,
+            blocks, coupling, rigid_matrix, want_hessian,
+        )
+    return energy
+
+
+@njit(cache=True)
+def elastic_slips(
+    positions, rigid_shift, rigid_turn, faces, face, weight, start_point, start_arm, start_slip, normal, rigid, count, slips
+):
+    """Write the trial elastic slip [m] of each frictional contact: tangential part of start_slip + relative motion.
+
+    rigid_shift, rigid_turn: translation [m] and rotation vector [rad] of each rigid body since the step's start,
+    shape (n_rigid, 3). A contact's rigid point has moved by shift + turn x start_arm: a ball that rolls does not slip.
+    """
+    x = np.empty(3)
+    for c in range(count):
+        for i in range(3):
+            slips[c, i] = start_slip[c, i]
+        if face[c] >= 0:
+            face_point(positions, faces[face[c]], weight[c], x)
+            for i in range(3):
+                slips[c, i] += x[i] - start_point[c, i]
+        if rigid[c] >= 0:
+            v, r = rigid_turn[rigid[c]], start_arm[c]
+            s = rigid_shift[rigid[c]]
+            slips[c, 0] -= s[0] + v[1] * r[2] - v[2] * r[1]
+            slips[c, 1] -= s[1] + v[2] * r[0] - v[0] * r[2]
+            slips[c, 2] -= s[2] + v[0] * r[1] - v[1] * r[0]
+        along = 0.0
+        for i in range(3):
+            along += slips[c, i] * normal[c, i]
+        for i in range(3):
+            slips[c, i] -= along * normal[c, i]
+
+
+@njit(cache=True)
+def friction_energy(slips, bound, stiffness, count):
+    r"""Return the Huber potential [J] of Coulomb friction at fixed bounds mu N [N].
+
+    k |s|^2/2 inside the cone (k |s| <= mu N), mu N |s| - (mu N)^2/(2 k) outside (the return mapping's potential; Simo and
+    Hughes, Computational Inelasticity, 1998, ch. 2, for the plastic analogue).
+    """
+    energy = 0.0
+    for c in range(count):
+        s = math.sqrt(slips[c, 0] ** 2 + slips[c, 1] ** 2 + slips[c, 2] ** 2)
+        k = stiffness[c]
+        if k * s <= bound[c]:
+            energy += 0.5 * k * s * s
+        else:
+            energy += bound[c] * s - 0.5 * bound[c] * bound[c] / k
+    return energy
+
+
+@njit(cache=True)
+def add_friction(
+    faces, face_slots, face, weight, slips, bound, stiffness, normal, start_arm, rigid, turn_jacobian, count,
+    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_hessian,
+):
+    """Add gradient and Hessian (both exact, for the lagged normal forces) of `friction_energy`.
+
+    turn_jacobian: d(turn)/d(phi) of each rigid body, shape (n_rigid, 3, 3).
+    """
+    spin, matrix, force, arm = np.zeros((3, 3)), np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    for c in range(count):
+        s = math.sqrt(slips[c, 0] ** 2 + slips[c, 1] ** 2 + slips[c, 2] ** 2)
+        k = stiffness[c]
+        sticks = k * s <= bound[c]
+        h = k if sticks else bound[c] / s
+        for i in range(3):
+            force[i] = h * slips[c, i]
+            for j in range(3):
+                matrix[i, j] = -h * normal[c, i] * normal[c, j]
+                if not sticks:
+                    matrix[i, j] -= h * slips[c, i] * slips[c, j] / (s * s)
+            matrix[i, i] += h
+        if rigid[c] >= 0:
+            arm[0, 0] = arm[1, 1] = arm[2, 2] = 0.0
+            arm[0, 1], arm[0, 2] = -start_arm[c, 2], start_arm[c, 1]
+            arm[1, 0], arm[1, 2] = start_arm[c, 2], -start_arm[c, 0]
+            arm[2, 0], arm[2, 1] = -start_arm[c, 1], start_arm[c, 0]
+            spin = arm @ turn_jacobian[rigid[c]]
+        _add_row(
+            faces, face_slots, face[c], weight[c], rigid[c], spin, force, matrix, gradient, rigid_gradient,
+            blocks, coupling, rigid_matrix, want_hessian,
+        )
+
+
+@njit(cache=True)
+def return_mapping(slips, bound, stiffness, count):
+    """Shorten each elastic slip to the cone, |s| <= mu N / k, in place."""
+    for c in range(count):
+        s = math.sqrt(slips[c, 0] ** 2 + slips[c, 1] ** 2 + slips[c, 2] ** 2)
+        limit = bound[c] / stiffness[c]
+        if s > limit:
+            for i in range(3):
+                slips[c, i] *= limit / s
+
+
+@njit(cache=True)
+def soft_step_limit(
+    positions, soft_direction, faces, sample_face, sample_weight, spacing, centre, rotation, field, low, high,
+    shift, spin, allowance,
+):
+    """Return the share of a move in which no soft sample can pass more than ``allowance`` [m] into a rigid body.
+
+    The distance is 1-Lipschitz, so a sample at distance d is safe while its motion relative to the body stays below
+    max(d - spacing/2, 0) + allowance; outside the body's box the distance to the box bounds d from below.
+    """
+    x, u, y = np.empty(3), np.empty(3), np.empty(3)
+    limit = 1.0
+    for s in range(sample_face.shape[0]):
+        nodes = faces[sample_face[s]]
+        face_point(positions, nodes, sample_weight[s], x)
+        face_point(soft_direction, nodes, sample_weight[s], u)
+        r = x - centre
+        u[0] -= shift[0] + spin[1] * r[2] - spin[2] * r[1]
+        u[1] -= shift[1] + spin[2] * r[0] - spin[0] * r[2]
+        u[2] -= shift[2] + spin[0] * r[1] - spin[1] * r[0]
+        move = math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+        if move <= allowance:
+            continue
+        outside = 0.0
+        for i in range(3):
+            y[i] = rotation[0, i] * r[0] + rotation[1, i] * r[1] + rotation[2, i] * r[2]
+            e = max(low[i] - y[i], y[i] - high[i], 0.0)
+            outside += e * e
+        d = math.sqrt(outside)
+        if move > d - 0.5 * spacing + allowance:
+            if d == 0.0:
+                d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
+            free = max(d - 0.5 * spacing, 0.0) + allowance
+            if move * limit > free:
+                limit = free / move
+    return limit
+
+
+@njit(cache=True)
+def plane_step_limit(heights, approach, allowance):
+    """Return the share of a move in which no point sinks more than ``allowance`` [m] below a plane.
+
+    heights: above the plane [m]; approach: how far the full move lowers each point [m]; both shape (n,).
+    """
+    limit = 1.0
+    for i in range(heights.shape[0]):
+        if approach[i] > 0.0:
+            free = max(heights[i], 0.0) + allowance
+            if approach[i] * limit > free:
+                limit = free / approach[i]
+    return limit

@@ -1,0 +1,172 @@
+"""The surface of all soft bodies as contact sees it: faces, sample points and flat triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from finqd.mechanics.elements import face_shape
+from finqd.scene import SoftBody
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactSurface:
+    """Faces, samples and triangles of all soft bodies, in scene numbering.
+
+    faces: vertex ids, -1 pads, shape (n_faces, k); face_body: soft body of each face, shape (n_faces,)
+    sample_face, sample_weight (n_samples, k), sample_area [m^2]: points that are finer than the mesh; points that
+        neighbouring faces share are merged
+    triangle_face, triangle_weight (n_triangles, 3, k): faces cut into flat triangles, corners as weights on the face
+    """
+
+    faces: np.ndarray
+    face_body: np.ndarray
+    sample_face: np.ndarray
+    sample_weight: np.ndarray
+    sample_area: np.ndarray
+    triangle_face: np.ndarray
+    triangle_weight: np.ndarray
+
+    @property
+    def sample_body(self) -> np.ndarray:
+        """Soft body of each sample, shape (n_samples,)."""
+        return self.face_body[self.sample_face]
+
+    @property
+    def triangle_body(self) -> np.ndarray:
+        """Soft body of each triangle, shape (n_triangles,)."""
+        return self.face_body[self.triangle_face]
+
+
+#: corners of the flat triangles of a face in its local coordinates; a quadrilateral gets its middle as a fourth
+#: corner pair, so that the split has the face's own symmetry
+_TRIANGLES = {
+    "tri3": [[(0, 0), (1, 0), (0, 1)]],
+    "tri6": [
+        [(0, 0), (0.5, 0), (0, 0.5)], [(0.5, 0), (1, 0), (0.5, 0.5)],
+        [(0, 0.5), (0.5, 0.5), (0, 1)], [(0.5, 0), (0.5, 0.5), (0, 0.5)],
+    ],
+    "quad4": [
+        [(-1, -1), (1, -1), (0, 0)], [(1, -1), (1, 1), (0, 0)], [(1, 1), (-1, 1), (0, 0)], [(-1, 1), (-1, -1), (0, 0)],
+    ],
+}
+_TRIANGLES["quad8"] = [
+    [edge, corner, (0, 0)]
+    for ring in ([(-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)],)
+    for edge, corner in zip(ring, ring[1:] + ring[:1], strict=True)
+]
+
+
+def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return local points (p, 2) of a lattice with n by m cells (n by n for a triangle) and their area shares, summing to 1.
+
+    The lattice includes the face's edges, since a face's rim is what touches first; the shares are the trapezoidal rule's.
+    """
+    if face_type.startswith("quad"):
+        u, v = np.linspace(-1, 1, n + 1), np.linspace(-1, 1, m + 1)
+        wu, wv = np.full(n + 1, 1.0 / n), np.full(m + 1, 1.0 / m)
+        wu[[0, -1]] *= 0.5
+        wv[[0, -1]] *= 0.5
+        points = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+        return points, np.outer(wu, wv).ravel()
+    index = {(i, j): None for i in range(n + 1) for j in range(n + 1 - i)}
+    order = {key: p for p, key in enumerate(index)}
+    share = np.zeros(len(order))
+    for i, j in order:
+        for cell in ([(i, j), (i + 1, j), (i, j + 1)], [(i + 1, j), (i + 1, j + 1), (i, j + 1)]):
+            if all(corner in order for corner in cell):
+                for corner in cell:
+                    share[order[corner]] += 1.0 / (3 * n * n)
+    return np.array(list(order), dtype=float) / n, share
+
+
+def _face_areas(points: np.ndarray, face_type: str) -> np.ndarray:
+    corners = points[:, : 4 if face_type.startswith("quad") else 3]
+    if corners.shape[1] == 3:
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    else:
+        cross = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    return 0.5 * np.linalg.norm(cross, axis=1)
+
+
+def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
+    """Return the lattice cells of each face in its two directions, shape (n_faces, 2)."""
+    def edge(a: int, b: int) -> np.ndarray:
+        return np.linalg.norm(points[:, a] - points[:, b], axis=1)
+
+    if face_type.startswith("quad"):
+        u, v = np.maximum(edge(0, 1), edge(3, 2)), np.maximum(edge(0, 3), edge(1, 2))
+    else:
+        u = v = np.maximum(np.maximum(edge(0, 1), edge(1, 2)), edge(2, 0))
+    return np.maximum(np.ceil(np.stack([u, v], axis=1) / spacing - 1e-6), 1).astype(int)
+
+
+def _samples(
+    points: np.ndarray, face_type: str, first_face: int, spacing: float, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return (face, weight, area, position) of all samples of one block of faces."""
+    cells, areas = _cells(points, face_type, spacing), _face_areas(points, face_type)
+    found: list[tuple[np.ndarray, ...]] = []
+    for n, m in np.unique(cells, axis=0):
+        local, share = lattice(face_type, int(n), int(m))
+        shape = face_shape(face_type, local)
+        which = np.flatnonzero((cells == (n, m)).all(axis=1))
+        weight = np.zeros((len(which) * len(local), width))
+        weight[:, : shape.shape[1]] = np.tile(shape, (len(which), 1))
+        found.append(
+            (
+                np.repeat(which + first_face, len(local)), weight, np.outer(areas[which], share).ravel(),
+                np.einsum("pk,fkx->fpx", shape, points[which]).reshape(-1, 3),
+            )
+        )
+    face, weight, area, position = (np.concatenate(part) for part in zip(*found, strict=True))
+    return face, weight, area, position
+
+
+def _merged(parts: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Merge samples of one body that coincide at rest (to a nanometre), adding their areas."""
+    face, weight, area, position = parts
+    _, first, inverse = np.unique(np.round(position, 9), axis=0, return_index=True, return_inverse=True)
+    return face[first], weight[first], np.bincount(inverse.ravel(), area)
+
+
+def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSurface:
+    """Return the surface of ``bodies`` with samples at most ``spacing`` [m] apart; faces that are held are left out."""
+    kinds = [(body, kind) for body in bodies for kind, faces in sorted(body.mesh.faces.items()) if len(faces)]
+    width = max((body.mesh.faces[kind].shape[1] for body, kind in kinds), default=4)
+    faces, face_body, samples, triangles = [], [], [], []
+    first_face = 0
+    for number, body in enumerate(bodies):
+        parts = []
+        for kind in sorted(body.mesh.faces):
+            block = body.mesh.faces[kind]
+            block = block[~body.fixed.all(axis=1)[block].all(axis=1)] if len(block) else block
+            if not len(block):
+                continue
+            padded = np.full((len(block), width), -1, dtype=np.int64)
+            padded[:, : block.shape[1]] = block + body.first_vertex
+            faces.append(padded)
+            face_body.append(np.full(len(block), number))
+            parts.append(_samples(body.mesh.vertices[block], kind, first_face, spacing, width))
+            corners = face_shape(kind, np.array(_TRIANGLES[kind], dtype=float).reshape(-1, 2)).reshape(-1, 3, block.shape[1])
+            weight = np.zeros((len(block) * len(corners), 3, width))
+            weight[:, :, : block.shape[1]] = np.tile(corners, (len(block), 1, 1))
+            triangles.append((np.repeat(np.arange(len(block)) + first_face, len(corners)), weight))
+            first_face += len(block)
+        if parts:
+            samples.append(_merged(tuple(np.concatenate(p) for p in zip(*parts, strict=True))))
+    if not faces:
+        empty = np.zeros(0, dtype=np.int64)
+        return ContactSurface(
+            faces=np.zeros((0, width), dtype=np.int64), face_body=empty, sample_face=empty,
+            sample_weight=np.zeros((0, width)), sample_area=np.zeros(0), triangle_face=empty,
+            triangle_weight=np.zeros((0, 3, width)),
+        )
+    sample_face, sample_weight, sample_area = (np.concatenate(p) for p in zip(*samples, strict=True))
+    triangle_face, triangle_weight = (np.concatenate(p) for p in zip(*triangles, strict=True))
+    return ContactSurface(
+        faces=np.concatenate(faces), face_body=np.concatenate(face_body), sample_face=sample_face,
+        sample_weight=sample_weight, sample_area=sample_area, triangle_face=triangle_face, triangle_weight=triangle_weight,
+    )

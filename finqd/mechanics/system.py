@@ -1,0 +1,171 @@
+"""A scene made ready for stepping: arrays, potentials, sparsity, and buffers for derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from finqd.mechanics.assembly_kernels import hold, largest_force
+from finqd.mechanics.mass import lumped_masses
+from finqd.mechanics.pattern import BlockPattern
+from finqd.mechanics.state import Direction, State
+
+if TYPE_CHECKING:
+    from finqd.contracts import Contact
+    from finqd.scene import Scene
+
+
+@dataclass(kw_only=True)
+class Derivatives:
+    """Gradient and Hessian of all potentials; buffers that are filled anew at each evaluation.
+
+    soft: dE/dpositions [N], (n_vertices, 3); rigid: force [N] and torque [N m], (n_rigid, 6)
+    blocks: soft Hessian, (n_blocks, 3, 3); coupling: (3 n_vertices, 6 n_rigid); rigid_matrix: (6 n_rigid, 6 n_rigid)
+    """
+
+    soft: np.ndarray
+    rigid: np.ndarray
+    blocks: np.ndarray
+    coupling: np.ndarray
+    rigid_matrix: np.ndarray
+
+    def clear(self, *, hessian: bool) -> None:
+        """Set everything that will be added to, to zero."""
+        self.soft[:] = 0.0
+        self.rigid[:] = 0.0
+        if hessian:
+            self.blocks[:] = 0.0
+            self.coupling[:] = 0.0
+            self.rigid_matrix[:] = 0.0
+
+
+class System:
+    """Everything of a `Scene` that steppers need.
+
+    masses: lumped [kg], (n_vertices,); forces: gravity and dead loads [N], (n_vertices, 3)
+    rigid_masses [kg], (n_rigid,); rigid_inertias: body frame [kg m^2], (n_rigid, 3, 3); rigid_forces [N], (n_rigid, 3)
+    rigid_sizes: radius that turns a torque into a force for the residual [m], (n_rigid,)
+    fixed: bool, (n_vertices, 3)
+    """
+
+    def __init__(self, scene: Scene, *, contact: Contact) -> None:
+        self.scene = scene
+        soft, rigid = scene.soft_bodies, scene.rigid_bodies
+        n, m = scene.n_vertices, len(rigid)
+
+        def stacked(rows: list[np.ndarray], *shape: int) -> np.ndarray:
+            return np.concatenate(rows) if rows else np.zeros((0, *shape))
+
+        self.masses = stacked([lumped_masses(b.mesh, b.material.density) for b in soft])
+        self.forces = stacked([b.loads for b in soft], 3) + self.masses[:, None] * scene.gravity
+        self.fixed = stacked([b.fixed for b in soft], 3).astype(bool)
+        self.rigid_masses = np.array([b.shape.mass for b in rigid])
+        self.rigid_inertias = np.array([b.shape.inertia for b in rigid]).reshape(m, 3, 3)
+        self.rigid_forces = np.array([b.force + b.shape.mass * scene.gravity for b in rigid]).reshape(m, 3)
+        self.rigid_sizes = np.array([b.shape.bounding_radius for b in rigid])
+        self.potentials = [b.elasticity.potential(b.mesh, b.material, first_vertex=b.first_vertex) for b in soft]
+        self.pattern = BlockPattern.from_cliques(n, [c for p in self.potentials for c in p.cliques])
+        self.slots = [tuple(self.pattern.slots(c) for c in p.cliques) for p in self.potentials]
+        self.contact = contact.potential(scene)
+        self.contact.bind(self.pattern)
+        self.derivatives = Derivatives(
+            soft=np.zeros((n, 3)), rigid=np.zeros((m, 6)), blocks=np.zeros((self.pattern.n_blocks, 3, 3)),
+            coupling=np.zeros((3 * n, 6 * m)), rigid_matrix=np.zeros((6 * m, 6 * m)),
+        )
+        self.solvers: dict[tuple, object] = {}  # of the steppers, by their settings: they keep lagged factorisations
+
+    @property
+    def n_vertices(self) -> int:
+        return len(self.masses)
+
+    @property
+    def n_rigid(self) -> int:
+        return len(self.rigid_masses)
+
+    def initial_state(self) -> State:
+        """Return the scene's start: bodies at rest shape, with the velocities given."""
+        soft, rigid = self.scene.soft_bodies, self.scene.rigid_bodies
+        rotations = np.array([b.rotation for b in rigid]).reshape(-1, 3, 3)
+        spins = np.array([b.angular_velocity for b in rigid]).reshape(-1, 3)
+        inertias = rotations @ self.rigid_inertias @ rotations.transpose(0, 2, 1)
+        return State(
+            time=0.0,
+            positions=np.concatenate([b.start_positions for b in soft]) if soft else np.zeros((0, 3)),
+            velocities=np.concatenate([b.velocities for b in soft]) if soft else np.zeros((0, 3)),
+            rigid_positions=np.array([b.position for b in rigid]).reshape(-1, 3),
+            rigid_rotations=rotations,
+            rigid_velocities=np.array([b.velocity for b in rigid]).reshape(-1, 3),
+            angular_momenta=np.einsum("bij,bj->bi", inertias, spins),
+            progress=np.zeros(len(self.scene.motions)),
+        )
+
+    def world_inertias(self, rotations: np.ndarray) -> np.ndarray:
+        """Return the rigid bodies' inertias [kg m^2] in the world frame, shape (n_rigid, 3, 3)."""
+        return rotations @ self.rigid_inertias @ rotations.transpose(0, 2, 1)
+
+    def advanced_progress(self, state: State, dt: float) -> np.ndarray:
+        """Return how far each drive is after a step of ``dt``, given the contact forces at ``state``."""
+        forces = self.contact.soft_forces
+        return np.array(
+            [
+                motion.advanced(state.progress[i], time=state.time, dt=dt, force=forces[self.scene.soft_bodies.index(body)])
+                for i, (body, _, motion) in enumerate(self.scene.motions)
+            ]
+        )
+
+    def prescribe(self, positions: np.ndarray, progress: np.ndarray, time: float) -> None:
+        """Write the positions of driven vertices at ``time`` into ``positions``."""
+        for i, (body, nodes, motion) in enumerate(self.scene.motions):
+            pose = motion.pose(float(progress[i]), time)
+            positions[nodes + body.first_vertex] = body.start_positions[nodes] @ pose[:3, :3].T + pose[:3, 3]
+
+    def elastic_energy(self, positions: np.ndarray) -> float:
+        """Return the elastic energy of all soft bodies [J]."""
+        return sum(p.energy(positions) for p in self.potentials)
+
+    def energy(self, state: State) -> float:
+        """Return elastic, contact, friction and dead-load energy [J]."""
+        dead = np.vdot(self.forces, state.positions) + np.vdot(self.rigid_forces, state.rigid_positions)
+        return self.elastic_energy(state.positions) + self.contact.energy(state) - dead
+
+    def derive(self, state: State, *, hessian: bool, projected: bool = False) -> float:
+        """Fill `derivatives` with gradient (and Hessian) of `energy`, and return that energy [J]."""
+        d = self.derivatives
+        d.clear(hessian=hessian)
+        energy = -np.vdot(self.forces, state.positions) - np.vdot(self.rigid_forces, state.rigid_positions)
+        d.soft -= self.forces
+        d.rigid[:, :3] -= self.rigid_forces
+        for potential, slots in zip(self.potentials, self.slots, strict=True):
+            energy += potential.add_gradient(state.positions, d.soft)
+            if hessian:
+                potential.add_hessian(state.positions, slots, d.blocks, projected=projected)
+        return energy + self.contact.add_derivatives(state, d, hessian=hessian)
+
+    def hold_fixed(self) -> None:
+        """Make held degrees of freedom drop out of the Hessian and the gradient."""
+        d = self.derivatives
+        hold(self.pattern.indptr, self.pattern.indices, self.fixed, d.blocks, d.coupling)
+        d.soft[self.fixed] = 0.0
+
+    def residual(self) -> tuple[float, str]:
+        """Return the largest unbalanced force in `derivatives` [N] and what it acts on; a torque counts over the body's size."""
+        d = self.derivatives
+        best, vertex = largest_force(d.soft, self.fixed)
+        where = self._vertex_name(vertex) if vertex >= 0 else ""
+        for i, row in enumerate(d.rigid):
+            force = max(np.linalg.norm(row[:3]), np.linalg.norm(row[3:]) / self.rigid_sizes[i])
+            if not force <= best:
+                best, where = float(force), self.scene.rigid_bodies[i].name
+        return float(best), where
+
+    def _vertex_name(self, vertex: int) -> str:
+        for body in self.scene.soft_bodies:
+            if vertex < body.first_vertex + body.mesh.n_vertices:
+                return f"{body.name}, vertex {vertex - body.first_vertex}"
+        return f"vertex {vertex}"
+
+    def zero_direction(self) -> Direction:
+        """Return a direction in which nothing moves."""
+        return Direction(soft=np.zeros((self.n_vertices, 3)), rigid=np.zeros((self.n_rigid, 6)))
