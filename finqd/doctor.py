@@ -22,7 +22,7 @@ LIBRARIES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "gmsh": "gmsh", "trimesh": "trimesh", "fcl": "python-fcl",
     "networkx": "networkx", "rtree": "rtree", "ribs": "ribs", "qdldl": "qdldl", "shapely": "shapely",
     "meshio": "meshio", "pydantic": "pydantic", "rich": "rich", "matplotlib": "matplotlib", "click": "click",
-    "pebble": "pebble",
+    "pebble": "pebble", "annotated_types": "annotated-types", "threadpoolctl": "threadpoolctl",
 }
 
 #: linear solvers: module -> (distribution, what it is, how to get it)

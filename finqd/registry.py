@@ -109,8 +109,10 @@ def create(kind: str, spec: str | Mapping[str, Any], *, where: str = "") -> Any:
 
 def options(kind: str, name: str) -> list[Option]:
     """Return the options of a plugin, in the order of its fields."""
-    schemas = option_schemas(load(kind, name))
-    return [Option(key, unit_of(key), schema.get("default"), in_words(schema), schema) for key, schema in schemas.items()]
+    return [
+        Option(key, unit_of(key), schema.get("default"), in_words(schema), schema)
+        for key, schema in option_schemas(load(kind, name)).items()
+    ]
 
 
 def _known(kind: str, where: str = "") -> str:

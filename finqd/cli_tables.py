@@ -1,0 +1,147 @@
+"""What the commands print: tables on stdout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from finqd.doctor import Finding
+    from finqd.registry import Option
+
+#: a table is never squeezed below this: when stdout is a file there is no terminal whose width would matter
+MINIMUM_WIDTH = 110
+
+
+def print_evaluation(result: Mapping[str, Any]) -> None:
+    """Print a result (`finqd.evaluate.Evaluation.to_dict`): a row an object, reasons of failures, totals."""
+    console = _console()
+    objects: Mapping[str, Mapping[str, Any]] = result["objects"]
+    table = _table(
+        "object", "held", "drop [mm]>", "margin>", "force [N]>", "penetration [mm]>", "steps>", "Newton iterations>",
+        "seconds>",
+    )
+    for name, row in objects.items():
+        verdict = "[green]yes[/green]" if row["held"] else "no"
+        if row["status"] != "ok":
+            verdict = f"[red]{escape(str(row['status']))}[/red]"
+        table.add_row(
+            escape(name), verdict, _number(row.get("drop_mm"), 2), _number(row.get("margin"), 3),
+            _number(row.get("max_contact_force_N"), 2), _number(row.get("max_penetration_mm"), 4),
+            _number(row.get("steps"), 0), _number(row.get("newton_iterations"), 0), _number(row.get("seconds"), 1),
+        )
+    console.print(table)
+    for name, row in objects.items():
+        if row.get("reason"):
+            console.print(f"{escape(name)}: {escape(str(row['reason']))}", soft_wrap=True)
+    held = sum(bool(row["held"]) for row in objects.values())
+    fitness, margin = _number(result["fitness"], 3), _number(result["margin"], 3)
+    console.print(f"fitness {fitness} ({held} of {len(objects)} held), margin {margin}")
+    for part in ("features", "mesh", "effects", "timings", "assumptions"):
+        _print_part(console, part, result.get(part))
+
+
+def print_plugins(kind: str | None) -> None:
+    """Print every registered plugin: who brought it, its one line, its options. One that does not load says why."""
+    from finqd import registry
+    from finqd.errors import FinqdError
+
+    console = _console()
+    for entry in registry.entries(kind):
+        title = f"[bold]{entry.kind} {escape(entry.name)}[/bold] ({escape(entry.distribution)} {escape(entry.version)})"
+        try:
+            summary = (registry.load(entry.kind, entry.name).__doc__ or "").strip().partition("\n")[0]
+            lines = [_option_line(option) for option in registry.options(entry.kind, entry.name)]
+        except FinqdError as error:
+            summary, lines = f"[red]{escape(str(error))}[/red]", []
+        else:
+            summary = escape(summary)
+        console.print(f"{title}: {summary}", soft_wrap=True)
+        for line in lines:
+            console.print(f"    {escape(line)}", soft_wrap=True)
+
+
+def print_objects() -> None:
+    """Print the objects that come with finqd: name, mass, size, description."""
+    from finqd.data import bundled_names, objects_folder
+    from finqd.objects import load_object
+
+    table = _table("object", "mass [g]>", "size [mm]>")
+    for name in bundled_names(objects_folder()):
+        grasped = load_object(name)
+        size = 1e3 * (grasped.vertices.max(axis=0) - grasped.vertices.min(axis=0))
+        table.add_row(escape(name), f"{1e3 * grasped.mass:.1f}", " x ".join(f"{length:.1f}" for length in size))
+    _console().print(table)
+
+
+def print_designs() -> None:
+    """Print the designs that come with finqd, and where they are."""
+    from finqd.data import bundled_names, designs_folder
+    from finqd.json_input import read_json_object
+
+    table = _table("design", "file", "description")
+    for name in bundled_names(designs_folder()):
+        path = designs_folder() / f"{name}.json"
+        document, _ = read_json_object(path, kind="design")
+        table.add_row(escape(name), escape(str(path)), escape(str(document.get("description", ""))))
+    _console().print(table)
+
+
+def print_findings(findings: Sequence[Finding]) -> None:
+    """Print what `finqd.doctor.examine` found, and the verdict."""
+    from finqd.doctor import fit
+
+    console = _console()
+    colours = {"ok": "green", "optional": "yellow", "missing": "red"}
+    for finding in findings:
+        colour = colours[finding.status]
+        mark = f"[{colour}]{finding.status:<8}[/{colour}]"
+        console.print(f"{mark} {escape(finding.subject):<16} {escape(finding.detail)}", soft_wrap=True)
+    console.print("finqd can run here" if fit(findings) else "finqd cannot run here: something is missing")
+
+
+def _option_line(option: Option) -> str:
+    import json
+
+    return f"{option.name} = {json.dumps(option.default)}: {option.allowed}"
+
+
+def _print_part(console: Console, title: str, part: Any) -> None:
+    """Print a part of the result that is a mapping or a list, one line an entry."""
+    if not part:
+        return
+    console.print(f"[bold]{title}[/bold]")
+    for line in _entry_lines(part):
+        console.print(f"    {escape(line)}", soft_wrap=True)
+
+
+def _entry_lines(part: Any, prefix: str = "") -> list[str]:
+    if isinstance(part, Mapping):
+        stem = f"{prefix}." if prefix else ""
+        return [line for key, value in part.items() for line in _entry_lines(value, f"{stem}{key}")]
+    if isinstance(part, (list, tuple)) and any(isinstance(value, (Mapping, str)) for value in part):
+        return [line for value in part for line in _entry_lines(value, prefix)]
+    text = f"{part:.6g}" if isinstance(part, float) else str(part)
+    return [f"{prefix} = {text}" if prefix else text]
+
+
+def _table(*titles: str) -> Table:
+    """Return a table without lines between rows; a title that ends in ``>`` is of a column of numbers."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for title in titles:
+        side: Literal["left", "right"] = "right" if title.endswith(">") else "left"
+        table.add_column(escape(title.removesuffix(">")), justify=side, no_wrap=True)
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _console() -> Console:
+    console = Console(highlight=False)
+    return console if console.width >= MINIMUM_WIDTH else Console(highlight=False, width=MINIMUM_WIDTH)
