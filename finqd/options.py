@@ -142,7 +142,8 @@ def in_words(schema: Mapping[str, Any]) -> str:
         return " or ".join(in_words(part) for part in schema["anyOf"])
     if "enum" in schema or "const" in schema:
         values = schema["enum"] if "enum" in schema else [schema["const"]]
-        return "one of " + ", ".join(json.dumps(value) for value in values) if len(values) > 1 else json.dumps(values[0])
+        listed = ", ".join(json.dumps(value) for value in values)
+        return f"one of {listed}" if len(values) > 1 else listed
     words = _TYPES.get(str(schema.get("type", "")), "a value")
     if "maxItems" in schema and schema.get("minItems") == schema["maxItems"]:
         words += f" of {schema['maxItems']}"
