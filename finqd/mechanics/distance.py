@@ -6,7 +6,8 @@ import numpy as np
 
 from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, SURFACE, DistanceField
 
-LEAF_SIZE = 4  # triangles a leaf of the tree holds at most; 3 to 6 measure alike
+LEAF_SIZE = 4  # triangles a leaf of the tree holds at most; 2 to 8 measure alike
+FLAT = 1e-6  # a triangle lower than this share of its longest side is rounding noise in a single-precision file
 
 
 def sphere_field(radius: float) -> DistanceField:
@@ -30,30 +31,29 @@ def revolution_field(profile: np.ndarray) -> DistanceField:
     at_start[start[:, 0] == 0.0, 0] = 0.0  # an apex: its pseudonormal is along the axis
     at_start /= np.maximum(np.hypot(at_start[:, 0], at_start[:, 1]), 1e-300)[:, None]
     at_end = np.roll(at_start, -1, axis=0)
-    segments = np.column_stack([start, edge, length**-2.0, normal])[~on_axis]
-    ends = np.stack([at_start, at_end], axis=1)[~on_axis]
-    return _field(kind=REVOLUTION, segments=segments, segment_normals=ends)
+    rows = np.column_stack([start, edge, length**-2.0, normal, at_start, at_end, np.zeros(len(start))])
+    return _field(kind=REVOLUTION, rows=rows[~on_axis])
 
 
 def surface_field(vertices: np.ndarray, triangles: np.ndarray) -> DistanceField:
     """Return the field of a watertight, outward oriented triangle surface.
 
-    vertices: [m], shape (n, 3); triangles: shape (m, 3), every edge shared by exactly two of them (else ValueError),
-    none of zero area.
+    vertices: [m], shape (n, 3); triangles: shape (m, 3), every edge shared by exactly two of them (else ValueError).
     """
     vertices = np.asarray(vertices, dtype=float)
     triangles = np.asarray(triangles, dtype=np.int64)
-    normals = triangle_normals(vertices, triangles)
-    edge_of, edge_normals = _edge_normals(triangles, normals)
+    edge_of, neighbours = triangle_neighbours(triangles)
+    normals, flat = triangle_normals(vertices, triangles, neighbours)
+    edge_normals = _edge_normals(vertices, triangles, edge_of, neighbours, normals, flat)
     pseudonormals = _unit(np.concatenate([edge_normals, _vertex_normals(vertices, triangles, normals)]))
     features = np.concatenate([edge_of, triangles + len(edge_normals)], axis=1)
-    corners = vertices[triangles]
-    order, leaf_size = _leaf_order(corners.mean(axis=1))
-    corners = corners[order]
+    solid = np.flatnonzero(~flat)  # a flat triangle is no closer to anything than its neighbours are
+    order, leaf_size = _leaf_order(vertices[triangles[solid]].mean(axis=1))
+    order = solid[order]
+    corners = vertices[triangles[order]]
     return _field(
         kind=SURFACE,
-        corners=corners,
-        normals=normals[order],
+        rows=np.concatenate([corners.reshape(-1, 9), normals[order]], axis=1),
         features=features[order],
         pseudonormals=pseudonormals,
         boxes=_tree_boxes(corners, leaf_size),
@@ -61,10 +61,36 @@ def surface_field(vertices: np.ndarray, triangles: np.ndarray) -> DistanceField:
     )
 
 
-def triangle_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return unit normals of ``triangles``, shape (m, 3)."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    return _unit(np.cross(b - a, c - a))
+def triangle_normals(
+    vertices: np.ndarray, triangles: np.ndarray, neighbours: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals of ``triangles``, shape (m, 3), and which of them are flat (without area), shape (m,).
+
+    A flat triangle, as exporters leave them where one edge meets two, has no normal of its own: it gets that of its
+    neighbour across its longest side, as if that side had been flipped.
+    """
+    points = vertices[triangles]
+    cross = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    sides = np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2)
+    flat = np.linalg.norm(cross, axis=1) <= FLAT * sides.max(axis=1) ** 2
+    normals = _unit(cross)
+    rows = np.flatnonzero(flat)
+    normals[rows] = normals[neighbours[rows, np.argmax(sides[rows], axis=1)]]
+    return normals, flat
+
+
+def triangle_neighbours(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (edge_of, neighbours), both of shape (m, 3): edge number, and the triangle beyond sides ab, bc, ca.
+
+    Raises ValueError if an edge is not shared by exactly two triangles.
+    """
+    edges, edge_of, counts = edge_table(triangles)
+    if np.any(counts != 2):
+        raise ValueError(f"{np.count_nonzero(counts != 2)} edges are not shared by exactly two triangles")
+    pairs = np.argsort(edge_of.reshape(-1), kind="stable").reshape(-1, 2)
+    neighbours = np.empty(triangles.size, dtype=np.int64)
+    neighbours[pairs[:, 0]], neighbours[pairs[:, 1]] = pairs[:, 1] // 3, pairs[:, 0] // 3
+    return edge_of, neighbours.reshape(-1, 3)
 
 
 def edge_table(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -81,13 +107,10 @@ def edge_table(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def _field(**given) -> DistanceField:
     """Fill what is not given with empty arrays, and fix types and memory order: one Numba type for all shapes."""
-    shapes = {
-        "segments": (0, 7), "segment_normals": (0, 2, 2), "corners": (0, 3, 3), "normals": (0, 3),
-        "features": (0, 6), "pseudonormals": (0, 3), "boxes": (0, 6),
-    }  # fmt: skip
+    columns = {"rows": 12, "features": 6, "pseudonormals": 3, "boxes": 6}
     arrays = {
-        name: np.ascontiguousarray(given.get(name, np.zeros(shape)), dtype="i4" if name == "features" else "f8")
-        for name, shape in shapes.items()
+        name: np.ascontiguousarray(given.get(name, np.zeros((0, n))), dtype="i4" if name == "features" else "f8")
+        for name, n in columns.items()
     }
     kind, radius, leaf_size = given["kind"], given.get("radius", 0.0), given.get("leaf_size", 0)
     return DistanceField(kind=kind, radius=radius, leaf_size=leaf_size, **arrays)
@@ -98,16 +121,23 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None]
 
 
-def _edge_normals(triangles: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edge of each triangle side, shape (m, 3), and the sum of both triangle normals at each edge."""
-    edges, edge_of, counts = edge_table(triangles)
-    if np.any(counts != 2):
-        raise ValueError(f"{np.count_nonzero(counts != 2)} edges are not shared by exactly two triangles")
-    sums = np.zeros((len(edges), 3))
-    for side in range(3):
-        for axis in range(3):
-            sums[:, axis] += np.bincount(edge_of[:, side], weights=normals[:, axis], minlength=len(edges))
-    return edge_of, sums
+def _edge_normals(
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    edge_of: np.ndarray,
+    neighbours: np.ndarray,
+    normals: np.ndarray,
+    flat: np.ndarray,
+) -> np.ndarray:
+    """Return the sum of both triangle normals at each edge, shape (n_edges, 3)."""
+    sums = np.empty((edge_of.max() + 1, 3))
+    sums[edge_of] = normals[:, None, :] + normals[neighbours]
+    for row in np.flatnonzero(flat):  # beyond the longest side lie, in truth, the neighbours of the other two
+        points = vertices[triangles[row]]
+        longest = np.argmax(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1))
+        others = neighbours[row, [(longest + 1) % 3, (longest + 2) % 3]]
+        sums[edge_of[row, longest]] = 2 * normals[neighbours[row, longest]] + normals[others].sum(axis=0)
+    return sums
 
 
 def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -15,23 +15,23 @@ SPHERE, REVOLUTION, SURFACE = 0, 1, 2
 TOUCHING = 1e-12  # below this distance [m] the direction to the closest point is rounding noise
 
 #: kind: SPHERE, REVOLUTION or SURFACE
+#: leaf_size: triangles a leaf of the tree
 #: radius: of the sphere [m]
-#: segments: shape (n, 7), profile segments: start r, z, edge r, z [m], 1 / length^2 [1/m^2], outward normal r, z
-#: segment_normals: shape (n, 2, 2), unit pseudonormals (r, z) at the start and at the end of each segment
-#: corners: shape (n_slots, 3, 3), corners of the triangles [m] in the order of the tree's leaves
-#: normals: shape (n_slots, 3), unit outward normals of the triangles
+#: rows: of a solid of revolution, shape (n, 12), one profile segment each: start r, z, edge r, z [m], 1 / length^2
+#:     [1/m^2], outward normal r, z, unit pseudonormals r, z at its start and at its end, 0;
+#:     of a surface, shape (n_slots, 12), one triangle each, in the order of the tree's leaves: corners a, b, c [m],
+#:     unit outward normal
 #: features: shape (n_slots, 6), rows of `pseudonormals` for edges ab, bc, ca and for corners a, b, c
 #: pseudonormals: shape (n, 3), unit, angle-weighted normals of edges and vertices
 #: boxes: shape (2 n_leaves, 6), low and high corner of node i's box [m]; its children are nodes 2 i and 2 i + 1, the
 #:     root is node 1, and leaf j (node n_leaves + j) holds slots j leaf_size to (j + 1) leaf_size
-#: leaf_size: triangles a leaf
-DistanceField = namedtuple(
-    "DistanceField",
-    "kind radius segments segment_normals corners normals features pseudonormals boxes leaf_size",
-)
+#:
+#: Few arrays, and kernels that take arrays rather than the tuple: each array of a tuple costs two atomic operations of
+#: reference counting wherever the tuple is passed on, which came to half the time of a query.
+DistanceField = namedtuple("DistanceField", "kind leaf_size radius rows features pseudonormals boxes")
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _box_distance2(boxes, node, x, y, z):
     """Squared distance [m^2] from a point to box ``node``; 0 inside."""
     dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
@@ -40,16 +40,16 @@ def _box_distance2(boxes, node, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True)
-def _closest_parameters(corners, slot, x, y, z):
+@njit(cache=True, error_model="numpy")
+def _closest_parameters(rows, slot, x, y, z):
     """Closest point a + v ab + w ac of triangle ``slot`` to a point, and the feature it lies on.
 
     Returns (v, w, feature); feature 0: the face, 1 to 3: edges ab, bc, ca, 4 to 6: corners a, b, c. Region tests by
     the signs of barycentric coordinates as in C. Ericson, Real-Time Collision Detection (2005), section 5.1.5.
     """
-    ax, ay, az = corners[slot, 0, 0], corners[slot, 0, 1], corners[slot, 0, 2]
-    abx, aby, abz = corners[slot, 1, 0] - ax, corners[slot, 1, 1] - ay, corners[slot, 1, 2] - az
-    acx, acy, acz = corners[slot, 2, 0] - ax, corners[slot, 2, 1] - ay, corners[slot, 2, 2] - az
+    ax, ay, az = rows[slot, 0], rows[slot, 1], rows[slot, 2]
+    abx, aby, abz = rows[slot, 3] - ax, rows[slot, 4] - ay, rows[slot, 5] - az
+    acx, acy, acz = rows[slot, 6] - ax, rows[slot, 7] - ay, rows[slot, 8] - az
     apx, apy, apz = x - ax, y - ay, z - az
     bb = abx * abx + aby * aby + abz * abz
     bc = abx * acx + aby * acy + abz * acz
@@ -78,52 +78,51 @@ def _closest_parameters(corners, slot, x, y, z):
     return vb / total, vc / total, 0
 
 
-@njit(cache=True)
-def _offset(corners, slot, v, w, x, y, z):
+@njit(cache=True, error_model="numpy")
+def _offset(rows, slot, v, w, x, y, z):
     """Vector [m] from the point a + v ab + w ac of triangle ``slot`` to (x, y, z)."""
     u = 1.0 - v - w
     return (
-        x - (u * corners[slot, 0, 0] + v * corners[slot, 1, 0] + w * corners[slot, 2, 0]),
-        y - (u * corners[slot, 0, 1] + v * corners[slot, 1, 1] + w * corners[slot, 2, 1]),
-        z - (u * corners[slot, 0, 2] + v * corners[slot, 1, 2] + w * corners[slot, 2, 2]),
+        x - (u * rows[slot, 0] + v * rows[slot, 3] + w * rows[slot, 6]),
+        y - (u * rows[slot, 1] + v * rows[slot, 4] + w * rows[slot, 7]),
+        z - (u * rows[slot, 2] + v * rows[slot, 5] + w * rows[slot, 8]),
     )
 
 
-@njit(cache=True)
-def _closest_in_leaf(field, leaf, x, y, z, best, best_slot):
+@njit(cache=True, error_model="numpy")
+def _closest_in_leaf(rows, leaf_size, leaf, x, y, z, best, best_slot):
     """Return (squared distance [m^2], slot) of the closest triangle of a leaf, or the given ones if none is closer."""
-    for slot in range(leaf * field.leaf_size, (leaf + 1) * field.leaf_size):
-        v, w, feature = _closest_parameters(field.corners, slot, x, y, z)
+    for slot in range(leaf * leaf_size, (leaf + 1) * leaf_size):
+        v, w, feature = _closest_parameters(rows, slot, x, y, z)
         if feature == 0:
             # along the stored unit normal: exact where slivers make barycentric coordinates inaccurate
             d = (
-                (x - field.corners[slot, 0, 0]) * field.normals[slot, 0]
-                + (y - field.corners[slot, 0, 1]) * field.normals[slot, 1]
-                + (z - field.corners[slot, 0, 2]) * field.normals[slot, 2]
+                (x - rows[slot, 0]) * rows[slot, 9]
+                + (y - rows[slot, 1]) * rows[slot, 10]
+                + (z - rows[slot, 2]) * rows[slot, 11]
             )
             distance2 = d * d
         else:
-            dx, dy, dz = _offset(field.corners, slot, v, w, x, y, z)
+            dx, dy, dz = _offset(rows, slot, v, w, x, y, z)
             distance2 = dx * dx + dy * dy + dz * dz
         if distance2 < best:
             best, best_slot = distance2, slot
     return best, best_slot
 
 
-@njit(cache=True)
-def _closest_slot(field, x, y, z):
+@njit(cache=True, error_model="numpy")
+def _closest_slot(rows, boxes, leaf_size, x, y, z):
     """Slot of the triangle closest to a point: nearest child first, without a stack.
 
     The tree is complete, so a node's number tells its parent and its sibling; bit k of ``trail`` says whether the
     sibling of the ancestor k levels up is still to be visited.
     """
-    boxes = field.boxes
     n_leaves = boxes.shape[0] // 2
     best, best_slot = np.inf, 0
     node, trail = 1, 0
     while True:
         if node >= n_leaves:
-            best, best_slot = _closest_in_leaf(field, node - n_leaves, x, y, z, best, best_slot)
+            best, best_slot = _closest_in_leaf(rows, leaf_size, node - n_leaves, x, y, z, best, best_slot)
         else:
             near, far = 2 * node, 2 * node + 1
             near2, far2 = _box_distance2(boxes, near, x, y, z), _box_distance2(boxes, far, x, y, z)
@@ -145,22 +144,22 @@ def _closest_slot(field, x, y, z):
                 break
 
 
-@njit(cache=True)
-def _surface_distance(field, x, y, z):
+@njit(cache=True, error_model="numpy")
+def _surface_distance(rows, features, pseudonormals, boxes, leaf_size, x, y, z):
     r"""Signed distance [m] to a closed triangle surface and its gradient.
 
     The sign is that of the offset from the closest point times the angle-weighted pseudonormal there, which is right
-    everywhere on a watertight surface: J. A. Baerentzen, H. Aanaes, Signed distance computation using the angle weighted
-    pseudonormal (IEEE TVCG 11, 2005).
+    everywhere on a watertight surface: J. A. Baerentzen, H. Aanaes, Signed distance computation using the angle
+    weighted pseudonormal (IEEE TVCG 11, 2005).
     """
-    slot = _closest_slot(field, x, y, z)
-    v, w, feature = _closest_parameters(field.corners, slot, x, y, z)
-    dx, dy, dz = _offset(field.corners, slot, v, w, x, y, z)
+    slot = _closest_slot(rows, boxes, leaf_size, x, y, z)
+    v, w, feature = _closest_parameters(rows, slot, x, y, z)
+    dx, dy, dz = _offset(rows, slot, v, w, x, y, z)
     if feature == 0:
-        nx, ny, nz = field.normals[slot, 0], field.normals[slot, 1], field.normals[slot, 2]
+        nx, ny, nz = rows[slot, 9], rows[slot, 10], rows[slot, 11]
         return dx * nx + dy * ny + dz * nz, nx, ny, nz
-    row = field.features[slot, feature - 1]
-    nx, ny, nz = field.pseudonormals[row, 0], field.pseudonormals[row, 1], field.pseudonormals[row, 2]
+    row = features[slot, feature - 1]
+    nx, ny, nz = pseudonormals[row, 0], pseudonormals[row, 1], pseudonormals[row, 2]
     side = dx * nx + dy * ny + dz * nz
     d = np.sqrt(dx * dx + dy * dy + dz * dz)
     if d < TOUCHING:
@@ -170,14 +169,14 @@ def _surface_distance(field, x, y, z):
     return d, dx / d, dy / d, dz / d
 
 
-@njit(cache=True)
-def _closest_segment(segments, r, z):
+@njit(cache=True, error_model="numpy")
+def _closest_segment(rows, r, z):
     """Return (segment, parameter in [0, 1]) of the profile point closest to (r, z) [m]."""
     best, best_segment, best_t = np.inf, 0, 0.0
-    for i in range(segments.shape[0]):
-        dr, dz = r - segments[i, 0], z - segments[i, 1]
-        er, ez = segments[i, 2], segments[i, 3]
-        t = min(max((dr * er + dz * ez) * segments[i, 4], 0.0), 1.0)
+    for i in range(rows.shape[0]):
+        dr, dz = r - rows[i, 0], z - rows[i, 1]
+        er, ez = rows[i, 2], rows[i, 3]
+        t = min(max((dr * er + dz * ez) * rows[i, 4], 0.0), 1.0)
         dr -= t * er
         dz -= t * ez
         distance2 = dr * dr + dz * dz
@@ -186,8 +185,8 @@ def _closest_segment(segments, r, z):
     return best_segment, best_t
 
 
-@njit(cache=True)
-def _revolution_distance(field, x, y, z):
+@njit(cache=True, error_model="numpy")
+def _revolution_distance(rows, x, y, z):
     r"""Signed distance [m] to a solid of revolution about z and its gradient.
 
     .. math:: d(x, y, z) = d_{2D}(\sqrt{x^2 + y^2}, z)
@@ -195,16 +194,15 @@ def _revolution_distance(field, x, y, z):
     with the exact distance to the profile in the half plane r >= 0, signed by the pseudonormal of the closest segment
     or vertex. On the axis the radial direction is taken as x.
     """
-    segments = field.segments
     r = np.sqrt(x * x + y * y)
-    i, t = _closest_segment(segments, r, z)
-    dr, dz = r - segments[i, 0] - t * segments[i, 2], z - segments[i, 1] - t * segments[i, 3]
+    i, t = _closest_segment(rows, r, z)
+    dr, dz = r - rows[i, 0] - t * rows[i, 2], z - rows[i, 1] - t * rows[i, 3]
     if 0.0 < t < 1.0:
-        nr, nz = segments[i, 5], segments[i, 6]
+        nr, nz = rows[i, 5], rows[i, 6]
         d = dr * nr + dz * nz
     else:
-        end = 0 if t == 0.0 else 1
-        nr, nz = field.segment_normals[i, end, 0], field.segment_normals[i, end, 1]
+        end = 7 if t == 0.0 else 9
+        nr, nz = rows[i, end], rows[i, end + 1]
         d = dr * nr + dz * nz
         length = np.sqrt(dr * dr + dz * dz)
         if length >= TOUCHING:
@@ -215,12 +213,12 @@ def _revolution_distance(field, x, y, z):
     return d, nr, 0.0, nz
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def signed_distance(field, x, y, z):
     """Return ``(d, nx, ny, nz)``: signed distance [m], negative inside, and its gradient, a unit vector outwards.
 
-    field: `DistanceField`; x, y, z: a point in the field's frame [m]. The gradient is continuous through d = 0 on faces;
-    where the closest point is not unique (the medial axis) it belongs to one of them.
+    field: `DistanceField`; x, y, z: a point in the field's frame [m]. The gradient is continuous through d = 0 on
+    faces; where the closest point is not unique (the medial axis) it belongs to one of them.
     """
     if field.kind == SPHERE:
         length = np.sqrt(x * x + y * y + z * z)
@@ -228,11 +226,13 @@ def signed_distance(field, x, y, z):
             return length - field.radius, x / length, y / length, z / length
         return -field.radius, 0.0, 0.0, 1.0
     if field.kind == REVOLUTION:
-        return _revolution_distance(field, x, y, z)
-    return _surface_distance(field, x, y, z)
+        return _revolution_distance(field.rows, x, y, z)
+    return _surface_distance(
+        field.rows, field.features, field.pseudonormals, field.boxes, field.leaf_size, x, y, z
+    )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def signed_distances(field, points, distances, normals):
     """Fill ``distances`` [m], shape (n,), and ``normals``, shape (n, 3), for ``points`` [m], shape (n, 3)."""
     for i in range(points.shape[0]):
