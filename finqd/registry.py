@@ -17,7 +17,7 @@ from typing import Any
 
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, PluginError
-from finqd.options import checked, in_words, join, option_schemas, option_types
+from finqd.options import checked, in_words, join, nearest, option_schemas, option_types
 from finqd.units import unit_of
 
 
@@ -100,7 +100,11 @@ def create(kind: str, spec: str | Mapping[str, Any], *, where: str = "") -> Any:
         if key in types:
             values[key] = checked(types[key], value, join(where, key), PluginError)
         elif key != "name":
-            raise PluginError(f"{kind} {name!r} has no option {key!r}; allowed: {', '.join(types) or 'none'}", where)
+            near = nearest(str(key), types)
+            hint = f"; did you mean {near}?" if near else ""
+            raise PluginError(
+                f"{kind} {name!r} has no option {key!r}; allowed: {', '.join(types) or 'none'}{hint}", where
+            )
     try:
         return plugin(**values)
     except (TypeError, ValueError) as error:  # an option without default, or what __post_init__ says of a contradiction
