@@ -1,0 +1,401 @@
+"""Linear solvers for the Newton systems of a step: soft vertices and a few rigid unknowns.
+
+The system is
+
+    [[A, B], [B^T, C]] [x; y] = [r; s]
+
+with A symmetric and block sparse (soft, 3 n unknowns), C dense (rigid bodies, m = 6 a body) and B dense (contact
+couples them). Near buckling the matrix can be indefinite: a solver says so.
+
+Methods: ``cg`` (default), conjugate gradients preconditioned by the exact inverse of the system of an earlier
+iteration, kept until it serves badly; ``direct``; and ``cg`` with the preconditioners ``block_jacobi`` and ``jacobi``,
+which show what those cost at this conditioning. Decisions depend on counts, never on a clock: same input, same bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from finqd.errors import InputError
+from finqd.mechanics.linear_backends import Factorisation, create_factorisation
+from finqd.mechanics.linear_kernels import (
+    advance,
+    block_diagonal_product,
+    coupled_product,
+    dot,
+    subtract_product,
+    transposed_product,
+)
+from finqd.mechanics.pattern import BlockPattern
+
+METHODS = ("cg", "direct")
+PRECONDITIONERS = ("factorisation", "block_jacobi", "jacobi")
+
+#: a direct solution counts as converged if this share of the right-hand side is left at most
+_DIRECT_TOLERANCE = 1e-6
+#: smallest eigenvalue of a scaled Schur complement, as a share of the largest, that is told from zero
+_SINGULAR = 1e-14
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearSolution:
+    """What a solver returns.
+
+    soft, rigid: x and y, in the shapes of the right-hand sides
+    iterations: products with the matrix; factorised: whether A was factorised in this solve
+    definite: False if the matrix was found to be indefinite (or singular). x and y are then the solution of the
+        indefinite system if ``converged``, otherwise the last iterate before the negative curvature (zero if none)
+    converged: whether the residual is within the tolerance
+    """
+
+    soft: np.ndarray
+    rigid: np.ndarray
+    iterations: int
+    factorised: bool
+    definite: bool
+    converged: bool
+
+
+@dataclass(frozen=True)
+class CoupledMatrix:
+    """[[A, B], [B^T, C]]: ``blocks`` (n_blocks, 3, 3), ``coupling`` B (3 n, m), ``rigid`` C (m, m)."""
+
+    pattern: BlockPattern
+    blocks: np.ndarray
+    coupling: np.ndarray
+    rigid: np.ndarray
+
+    @property
+    def size(self) -> int:
+        return len(self.coupling) + len(self.rigid)
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        """Return the matrix times ``x`` (3 n + m,)."""
+        result = np.empty(len(x))
+        pattern = self.pattern
+        coupled_product(pattern.indptr, pattern.indices, self.blocks, self.coupling, self.rigid, x, result)
+        return result
+
+    def diagonal_blocks(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return the 3 x 3 diagonal blocks of A (n, 3, 3) and the 6 x 6 ones of C, one a rigid body."""
+        pattern = self.pattern
+        rows = np.repeat(np.arange(pattern.n_vertices), np.diff(pattern.indptr))
+        m = len(self.rigid)
+        bodies = [self.rigid[i : min(i + 6, m), i : min(i + 6, m)] for i in range(0, m, 6)]
+        return self.blocks[rows == pattern.indices], bodies
+
+
+class Preconditioner(Protocol):
+    """An approximate inverse; ``positive`` tells whether it is positive definite, which CG needs."""
+
+    positive: bool
+
+    def apply(self, residual: np.ndarray) -> np.ndarray:
+        """Return the approximate inverse times ``residual`` (3 n + m,)."""
+
+
+class CoupledInverse:
+    """The exact inverse of a coupled matrix, by elimination of the soft unknowns.
+
+    With W = A^-1 B and the Schur complement S = C - B^T W: y = S^-1 (s - W^T r), x = A^-1 r - W y. The inertias
+    of A and of S add up to that of the whole matrix (Haynsworth 1968), so both tell whether it is positive definite.
+    """
+
+    def __init__(self, factorisation: Factorisation, matrix: CoupledMatrix) -> None:
+        """Factorise ``matrix``; raises ``numpy.linalg.LinAlgError`` if it is singular."""
+        self._factorisation = factorisation
+        self.positive = factorisation.factorise(matrix.blocks)
+        self._size = len(matrix.coupling)
+        self._eliminated = np.zeros(matrix.coupling.shape)
+        self._schur_inverse = np.zeros((0, 0))
+        if matrix.coupling.shape[1]:
+            self._eliminated = np.ascontiguousarray(factorisation.solve(matrix.coupling))
+            schur = matrix.rigid - matrix.coupling.T @ self._eliminated
+            self._schur_inverse, definite = _symmetric_inverse(0.5 * (schur + schur.T))
+            self.positive = self.positive and definite
+
+    def fits(self, matrix: CoupledMatrix) -> bool:
+        """Tell whether ``matrix`` has the same number of unknowns as the one that was inverted."""
+        return self._eliminated.shape == matrix.coupling.shape
+
+    def apply(self, residual: np.ndarray) -> np.ndarray:
+        """See `Preconditioner`."""
+        soft, rigid = residual[: self._size], residual[self._size :]
+        result = np.empty(len(residual))
+        result[: self._size] = self._factorisation.solve(soft)
+        if len(rigid):
+            carried = np.empty(len(rigid))
+            transposed_product(self._eliminated, soft, carried)
+            y = self._schur_inverse @ (rigid - carried)
+            subtract_product(self._eliminated, y, result[: self._size])
+            result[self._size :] = y
+        return result
+
+
+def _symmetric_inverse(matrix: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the inverse of a small symmetric matrix and whether it is positive definite.
+
+    Rows are scaled by the diagonal first: metres and radians differ by orders of magnitude. Raises
+    ``numpy.linalg.LinAlgError`` if it is singular.
+    """
+    diagonal = np.abs(np.diag(matrix))
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale[None, :])
+    if not np.all(np.abs(values) > _SINGULAR * np.max(np.abs(values))):
+        raise np.linalg.LinAlgError("the Schur complement of the rigid bodies is singular")
+    vectors = scale[:, None] * vectors
+    return (vectors / values) @ vectors.T, bool(np.all(values > 0.0))
+
+
+class Jacobi:
+    """The inverse of the diagonal."""
+
+    def __init__(self, matrix: CoupledMatrix) -> None:
+        soft, rigid = matrix.diagonal_blocks()
+        diagonal = np.concatenate([np.einsum("nii->ni", soft).reshape(-1), *(np.diag(block) for block in rigid)])
+        self.positive = bool(np.all(diagonal > 0.0))
+        self._inverse = 1.0 / np.where(diagonal > 0.0, diagonal, 1.0)
+
+    def apply(self, residual: np.ndarray) -> np.ndarray:
+        """See `Preconditioner`."""
+        return self._inverse * residual
+
+
+class BlockJacobi:
+    """The inverses of the 3 x 3 blocks of the vertices and of the 6 x 6 blocks of the rigid bodies."""
+
+    def __init__(self, matrix: CoupledMatrix) -> None:
+        soft, rigid = matrix.diagonal_blocks()
+        self.positive = True
+        try:
+            np.linalg.cholesky(soft)
+            self._soft = np.linalg.inv(soft)
+            self._rigid = [cho_factor(block) for block in rigid]
+        except np.linalg.LinAlgError:
+            self.positive = False
+
+    def apply(self, residual: np.ndarray) -> np.ndarray:
+        """See `Preconditioner`."""
+        result = np.empty(len(residual))
+        size = 3 * len(self._soft)
+        block_diagonal_product(self._soft, residual[:size], result[:size])
+        for i, factor in enumerate(self._rigid):
+            body = slice(size + 6 * i, size + 6 * i + len(factor[0]))
+            result[body] = cho_solve(factor, residual[body])
+        return result
+
+
+@dataclass
+class _Iterate:
+    """Where conjugate gradients stand: x, the iterations spent, and how it ended."""
+
+    x: np.ndarray
+    iterations: int = 0
+    converged: bool = False
+    definite: bool = True
+
+
+def conjugate_gradients(
+    matrix: CoupledMatrix,
+    preconditioner: Preconditioner,
+    rhs: np.ndarray,
+    *,
+    start: np.ndarray | None = None,
+    tolerance: float,
+    max_iterations: int,
+) -> _Iterate:
+    """Solve ``matrix x = rhs`` by preconditioned conjugate gradients (Hestenes and Stiefel 1952; Shewchuk 1994, B3).
+
+    Stops when sqrt(r^T P r) <= tolerance sqrt(rhs^T P rhs), P the preconditioner: with a good one that is the error in
+    the energy norm, which mixes no newtons with newton metres. Stops as well at a direction without positive curvature,
+    before taking it: ``definite`` is then False.
+    """
+    state = _Iterate(np.zeros(len(rhs)) if start is None else start.copy())
+    residual = rhs.copy()
+    preconditioned = preconditioner.apply(residual)
+    size = dot(residual, preconditioned)
+    target = tolerance * tolerance * size
+    if start is not None:
+        residual -= matrix.product(start)
+        preconditioned = preconditioner.apply(residual)
+        size = dot(residual, preconditioned)
+    direction = preconditioned.copy()
+    while size > target and state.iterations < max_iterations:
+        product = matrix.product(direction)
+        state.iterations += 1
+        curvature = dot(direction, product)
+        if not curvature > 0.0:
+            state.definite = False
+            return state
+        advance(state.x, residual, direction, product, size / curvature)
+        preconditioned = preconditioner.apply(residual)
+        previous, size = size, dot(residual, preconditioned)
+        direction *= size / previous
+        direction += preconditioned
+    state.converged = size <= target
+    return state
+
+
+class LinearSolver:
+    """Solves one Newton system after the other; what it keeps between them is the preconditioner of an earlier one.
+
+    Made by `make_solver`. ``solve`` raises for no matrix: a singular or indefinite one is reported as such.
+    """
+
+    def __init__(
+        self,
+        pattern: BlockPattern,
+        *,
+        method: str,
+        preconditioner: str,
+        backend: str,
+        tolerance: float,
+        max_iterations: int,
+        refactor_after: int,
+    ) -> None:
+        self.pattern = pattern
+        self.method, self.preconditioner = method, preconditioner
+        self.tolerance, self.max_iterations, self.refactor_after = tolerance, max_iterations, refactor_after
+        self._factorisation: Factorisation | None = None
+        if method == "direct" or preconditioner == "factorisation":
+            self._factorisation = create_factorisation(backend, pattern)
+        self._lagged: CoupledInverse | None = None
+
+    def solve(
+        self,
+        blocks: np.ndarray,
+        coupling: np.ndarray,
+        rigid: np.ndarray,
+        rhs_soft: np.ndarray,
+        rhs_rigid: np.ndarray,
+        *,
+        tolerance: float | None = None,
+    ) -> LinearSolution:
+        """Solve [[A, B], [B^T, C]] [x; y] = [r; s].
+
+        blocks: A (n_blocks, 3, 3); coupling: B (3 n, m); rigid: C (m, m); rhs_soft: r, 3 n numbers of any shape;
+        rhs_rigid: s, m numbers of any shape; tolerance: see `conjugate_gradients`, the solver's own if None
+        """
+        m = rhs_rigid.size
+        matrix = CoupledMatrix(
+            self.pattern,
+            np.ascontiguousarray(blocks, dtype=float),
+            np.ascontiguousarray(coupling, dtype=float).reshape(rhs_soft.size, m),
+            np.ascontiguousarray(rigid, dtype=float).reshape(m, m),
+        )
+        rhs = np.concatenate([np.reshape(rhs_soft, -1), np.reshape(rhs_rigid, -1)]).astype(float)
+        tolerance = self.tolerance if tolerance is None else tolerance
+        if self.method == "direct":
+            state, factorised = self._direct(matrix, rhs)
+        elif self.preconditioner == "factorisation":
+            state, factorised = self._lagged_cg(matrix, rhs, tolerance)
+        else:
+            state, factorised = self._jacobi_cg(matrix, rhs, tolerance), False
+        finite = bool(np.all(np.isfinite(state.x)))
+        x = state.x if finite else np.zeros(len(rhs))
+        return LinearSolution(
+            soft=x[: rhs_soft.size].reshape(rhs_soft.shape),
+            rigid=x[rhs_soft.size :].reshape(rhs_rigid.shape),
+            iterations=state.iterations,
+            factorised=factorised,
+            definite=state.definite,
+            converged=state.converged and finite,
+        )
+
+    def forget(self) -> None:
+        """Drop the lagged preconditioner: the next system is known to be a different one."""
+        self._lagged = None
+
+    def _jacobi_cg(self, matrix: CoupledMatrix, rhs: np.ndarray, tolerance: float) -> _Iterate:
+        preconditioner = (Jacobi if self.preconditioner == "jacobi" else BlockJacobi)(matrix)
+        if not preconditioner.positive:
+            return _Iterate(np.zeros(len(rhs)), definite=False)
+        return conjugate_gradients(
+            matrix, preconditioner, rhs, tolerance=tolerance, max_iterations=self.max_iterations
+        )
+
+    def _direct(self, matrix: CoupledMatrix, rhs: np.ndarray) -> tuple[_Iterate, bool]:
+        assert self._factorisation is not None
+        try:
+            inverse = CoupledInverse(self._factorisation, matrix)
+        except np.linalg.LinAlgError:
+            return _Iterate(np.zeros(len(rhs)), definite=False), True
+        return _solve_directly(matrix, inverse, rhs), True
+
+    def _lagged_cg(self, matrix: CoupledMatrix, rhs: np.ndarray, tolerance: float) -> tuple[_Iterate, bool]:
+        """Iterate with the inverse of an earlier matrix; once that has cost as much as a new one, make a new one.
+
+        It is made for the next system, or at once, from where the iteration stands, after twice as many iterations.
+        """
+        state = _Iterate(np.zeros(len(rhs)))
+        if self._lagged is not None and self._lagged.fits(matrix):
+            state = conjugate_gradients(
+                matrix, self._lagged, rhs, tolerance=tolerance, max_iterations=2 * self.refactor_after
+            )
+            if not state.definite or state.iterations > self.refactor_after:
+                self._lagged = None
+            if not state.definite or state.converged:
+                return state, False
+        assert self._factorisation is not None
+        self._lagged = None
+        try:
+            inverse = CoupledInverse(self._factorisation, matrix)
+        except np.linalg.LinAlgError:
+            state.definite = False
+            return state, True
+        if not inverse.positive:
+            return _solve_directly(matrix, inverse, rhs), True
+        self._lagged = inverse
+        start, spent = (state.x, state.iterations) if state.iterations else (None, 0)
+        state = conjugate_gradients(
+            matrix, inverse, rhs, start=start, tolerance=tolerance, max_iterations=self.max_iterations
+        )
+        state.iterations += spent
+        return state, True
+
+
+def _solve_directly(matrix: CoupledMatrix, inverse: CoupledInverse, rhs: np.ndarray) -> _Iterate:
+    """Apply the inverse of ``matrix`` itself, and check what is left, each row weighed by its diagonal."""
+    x = inverse.apply(rhs)
+    residual = rhs - matrix.product(x)
+    soft, rigid = matrix.diagonal_blocks()
+    diagonal = np.concatenate([np.einsum("nii->ni", soft).reshape(-1), *(np.diag(block) for block in rigid)])
+    weight = 1.0 / np.where(diagonal == 0.0, 1.0, np.abs(diagonal))
+    left, given = dot(weight * residual, residual), dot(weight * rhs, rhs)
+    return _Iterate(x, 1, left <= _DIRECT_TOLERANCE**2 * given, inverse.positive)
+
+
+def make_solver(
+    pattern: BlockPattern,
+    *,
+    method: str = "cg",
+    preconditioner: str = "factorisation",
+    backend: str = "auto",
+    tolerance: float = 1e-6,
+    max_iterations: int = 10_000,
+    refactor_after: int = 8,
+) -> LinearSolver:
+    """Return a solver for systems whose soft matrix has the sparsity ``pattern``.
+
+    method: "cg" or "direct"; preconditioner (of cg): "factorisation", "block_jacobi" or "jacobi"
+    backend: library of the factorisation, "auto" for the fastest that is installed (see `linear_backends`)
+    tolerance: see `conjugate_gradients`; max_iterations: of one solve
+    refactor_after: iterations with a lagged preconditioner after which the next system gets a new one
+    Raises InputError for an unknown method, preconditioner or backend.
+    """
+    for what, value, known in (("method", method, METHODS), ("preconditioner", preconditioner, PRECONDITIONERS)):
+        if value not in known:
+            raise InputError(f"{value!r} is not a {what} of a linear solver; known are {', '.join(known)}", what)
+    return LinearSolver(
+        pattern,
+        method=method,
+        preconditioner=preconditioner,
+        backend=backend,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        refactor_after=refactor_after,
+    )

@@ -1,0 +1,331 @@
+"""Sparse factorisations of libraries behind one small contract, and which of them this machine has.
+
+A backend is built for one sparsity, then factorises values again and again:
+
+    factorisation = create_factorisation("auto", pattern)
+    positive = factorisation.factorise(blocks)      # is the matrix positive definite?
+    x = factorisation.solve(rhs)                    # shape (3 n, k)
+
+``qdldl`` is a permissively licensed wheel for every platform and always there; ``pardiso`` (extra ``fast``) and
+``cholmod`` (scikit-sparse) are faster and picked up when they are installed. All run on one thread and give the same
+bits for the same input.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.metadata
+import importlib.util
+import sys
+import weakref
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+
+from finqd.errors import InputError
+from finqd.mechanics.linear_kernels import gather
+from finqd.mechanics.pattern import BlockPattern
+
+#: fastest first: what "auto" takes is the first one that is installed
+BACKENDS = ("pardiso", "cholmod", "qdldl", "superlu")
+
+
+class Factorisation(Protocol):
+    """A sparse factorisation of a symmetric matrix whose sparsity stays."""
+
+    #: non-zeros of the triangular factor, after the first `factorise`; 0 where the library does not tell
+    factor_entries: int
+
+    def factorise(self, blocks: np.ndarray) -> bool:
+        """Factorise the matrix with these ``blocks`` (n_blocks, 3, 3); return whether it is positive definite.
+
+        Raises ``numpy.linalg.LinAlgError`` if it is singular, or indefinite and the library stops there.
+        """
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """Return the solution for right-hand sides of shape (3 n, k), or (3 n,)."""
+
+
+def available_backends() -> tuple[str, ...]:
+    """Return the names of the backends that this machine has, fastest first."""
+    have = {
+        "pardiso": _mkl_path() is not None,
+        "cholmod": importlib.util.find_spec("sksparse") is not None,
+        "qdldl": importlib.util.find_spec("qdldl") is not None,
+        "superlu": True,
+    }
+    return tuple(name for name in BACKENDS if have[name])
+
+
+def create_factorisation(backend: str, pattern: BlockPattern) -> Factorisation:
+    """Return an empty factorisation for ``pattern`` by ``backend`` ("auto": the fastest that is installed).
+
+    Raises InputError for a backend that is unknown or not installed.
+    """
+    available = available_backends()
+    name = available[0] if backend == "auto" else backend
+    if name not in available:
+        why = "is not installed" if name in BACKENDS else "is unknown"
+        raise InputError(f"the linear solver backend {name!r} {why}; this machine has {', '.join(available)}")
+    classes: dict[str, Any] = {
+        "pardiso": PardisoFactorisation,
+        "cholmod": CholmodFactorisation,
+        "qdldl": QdldlFactorisation,
+        "superlu": SuperluFactorisation,
+    }
+    return classes[name](pattern)
+
+
+class Rows:
+    """The rows of one triangle (or all) of a block matrix, entry by entry, and where each entry is in the blocks.
+
+    By symmetry the rows of the lower triangle are also the columns of the upper one: what a library that wants
+    compressed columns of the upper triangle takes. ``indptr`` (3 n + 1,), ``indices`` (n_entries,), both 32 bit.
+    """
+
+    def __init__(self, pattern: BlockPattern, part: str) -> None:
+        """``part``: "lower", "upper" (both with the diagonal) or "full"."""
+        counts = np.diff(pattern.indptr)
+        row_of_block = np.repeat(np.arange(pattern.n_vertices), counts)
+        rows = 3 * row_of_block[:, None, None] + np.arange(3)[None, :, None]
+        columns = 3 * pattern.indices[:, None, None] + np.arange(3)[None, None, :]
+        rows, columns = (np.broadcast_to(a, (pattern.n_blocks, 3, 3)).reshape(-1) for a in (rows, columns))
+        keep = {"lower": columns <= rows, "upper": columns >= rows, "full": np.ones(len(rows), bool)}[part]
+        source = np.flatnonzero(keep)
+        source = source[np.lexsort((columns[source], rows[source]))]
+        self.size = 3 * pattern.n_vertices
+        self.indptr = np.concatenate([[0], np.cumsum(np.bincount(rows[source], minlength=self.size))]).astype(np.int32)
+        self.indices = columns[source].astype(np.int32)
+        self.values = np.empty(len(source))
+        self._source = source.astype(np.uint32)
+
+    def fill(self, blocks: np.ndarray) -> np.ndarray:
+        """Copy ``blocks`` into ``values``, in the order of ``indices``, and return it."""
+        gather(blocks.reshape(-1), self._source, self.values)
+        return self.values
+
+    def as_columns(self) -> sp.csc_matrix:
+        """Return the transposed matrix; it shares its values with this object."""
+        return sp.csc_matrix((self.values, self.indices, self.indptr), shape=(self.size, self.size))
+
+
+class QdldlFactorisation:
+    """L D L^T of the library QDLDL (Apache licence), with approximate minimum degree ordering."""
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        self._rows = Rows(pattern, "lower")
+        self._solver: Any = None
+        self.factor_entries = 0
+
+    def factorise(self, blocks: np.ndarray) -> bool:
+        """See `Factorisation`."""
+        import qdldl
+
+        self._rows.fill(blocks)
+        matrix = self._rows.as_columns()
+        try:
+            if self._solver is None:
+                self._solver = qdldl.Solver(matrix, upper=True)
+            else:
+                self._solver.update(matrix, upper=True)
+        except (RuntimeError, ValueError) as error:
+            self._solver = None
+            raise np.linalg.LinAlgError("the matrix is singular") from error
+        lower, diagonal, _ = self._solver.factors()
+        self.factor_entries = lower.nnz + self._rows.size
+        if not np.all(np.isfinite(diagonal)):
+            raise np.linalg.LinAlgError("the matrix is singular")
+        return bool(np.all(diagonal > 0.0))
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """See `Factorisation`."""
+        if rhs.ndim == 1:
+            return self._solver.solve(rhs)
+        solution = np.empty(rhs.shape, order="F")
+        for column in range(rhs.shape[1]):
+            solution[:, column] = self._solver.solve(np.ascontiguousarray(rhs[:, column]))
+        return solution
+
+
+class SuperluFactorisation:
+    """L U of SciPy's SuperLU in symmetric mode: the slowest, but always there."""
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        self._rows = Rows(pattern, "full")
+        self._factors: Any = None
+        self.factor_entries = 0
+
+    def factorise(self, blocks: np.ndarray) -> bool:
+        """See `Factorisation`. Without off-diagonal pivots L U is L D L^T: U's diagonal shows the inertia."""
+        from scipy.sparse.linalg import splu
+
+        self._rows.fill(blocks)
+        try:
+            self._factors = splu(
+                self._rows.as_columns(),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise np.linalg.LinAlgError("the matrix is singular") from error
+        upper = self._factors.U
+        self.factor_entries = upper.nnz
+        return bool(np.array_equal(self._factors.perm_r, self._factors.perm_c) and np.all(upper.diagonal() > 0.0))
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """See `Factorisation`."""
+        return self._factors.solve(rhs)
+
+
+class CholmodFactorisation:
+    """Supernodal Cholesky of SuiteSparse through scikit-sparse 0.4; stops at an indefinite matrix."""
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        self._rows = Rows(pattern, "full")
+        self._factor: Any = None
+        self.factor_entries = 0
+
+    def factorise(self, blocks: np.ndarray) -> bool:
+        """See `Factorisation`."""
+        from sksparse.cholmod import CholmodError, analyze
+
+        self._rows.fill(blocks)
+        matrix = self._rows.as_columns()
+        try:
+            if self._factor is None:
+                self._factor = analyze(matrix)
+            self._factor.cholesky_inplace(matrix)
+            self.factor_entries = self._factor.L().nnz if self.factor_entries == 0 else self.factor_entries
+        except CholmodError as error:
+            raise np.linalg.LinAlgError("the matrix is not positive definite") from error
+        return True
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """See `Factorisation`."""
+        return self._factor(rhs)
+
+
+class PardisoFactorisation:
+    """MKL's Pardiso: supernodal Cholesky, and Bunch-Kaufman L D L^T where the matrix turns out to be indefinite."""
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        self._rows = Rows(pattern, "upper")
+        self._positive = _Pardiso(self._rows, 2)
+        self._indefinite: _Pardiso | None = None
+        self._current = self._positive
+        self.factor_entries = 0
+
+    def factorise(self, blocks: np.ndarray) -> bool:
+        """See `Factorisation`."""
+        self._rows.fill(blocks)
+        if self._positive.factorise():
+            self._current = self._positive
+            self.factor_entries = int(self._positive.parameters[17])
+            return True
+        if self._indefinite is None:
+            self._indefinite = _Pardiso(self._rows, -2)
+        self._current = self._indefinite
+        if not self._indefinite.factorise() or self._indefinite.parameters[13] > 0:  # perturbed pivots
+            raise np.linalg.LinAlgError("the matrix is singular")
+        return bool(self._indefinite.parameters[22] == 0)
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """See `Factorisation`."""
+        return self._current.solve(rhs)
+
+
+class _Pardiso:
+    """One matrix of MKL's ``pardiso``: analysed once, factorised many times, freed with the object.
+
+    The parameters are those of the manual, counted from zero here ("Intel oneMKL developer reference, pardiso iparm").
+    """
+
+    def __init__(self, rows: Rows, matrix_type: int) -> None:
+        self._rows, self._type = rows, matrix_type
+        self._handle = np.zeros(64, np.int64)
+        self.parameters = np.zeros(64, np.int32)
+        self.parameters[0] = 1  # take the values below, no defaults
+        self.parameters[1] = 0  # minimum degree: less fill than METIS on chains of thin walls (measured)
+        self.parameters[9] = 8  # pivots below 1e-8 |A| are perturbed
+        self.parameters[17] = -1  # report the entries of the factor
+        self.parameters[20] = 1  # Bunch-Kaufman pivots
+        self.parameters[34] = 1  # indices from zero
+        self._analysed = False
+        arguments = (self._handle, self.parameters, rows, matrix_type)
+        self._release = weakref.finalize(self, _call_pardiso, -1, *arguments)
+        self._arguments = arguments
+
+    def factorise(self) -> bool:
+        """Factorise the current values of the rows; False if a pivot has the wrong sign or is zero."""
+        if not self._analysed:
+            _check(_call_pardiso(11, *self._arguments))
+            self._analysed = True
+        error = _call_pardiso(22, *self._arguments)
+        if error == -4:
+            return False
+        _check(error)
+        return True
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        rhs = np.asfortranarray(rhs, dtype=float)
+        solution = np.empty_like(rhs, order="F")
+        _check(_call_pardiso(33, *self._arguments, rhs, solution))
+        return solution
+
+
+def _check(error: int) -> None:
+    if error != 0:
+        raise np.linalg.LinAlgError(f"Pardiso failed with error {error}")
+
+
+def _call_pardiso(
+    phase: int,
+    handle: np.ndarray,
+    parameters: np.ndarray,
+    rows: Rows,
+    matrix_type: int,
+    rhs: np.ndarray | None = None,
+    solution: np.ndarray | None = None,
+) -> int:
+    """Run one phase of MKL's ``pardiso`` and return its error code."""
+
+    def pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:
+        return None if array is None else ctypes.c_void_p(array.ctypes.data)
+
+    def integer(value: int) -> Any:
+        return ctypes.byref(ctypes.c_int32(value))
+
+    error = ctypes.c_int32(0)
+    columns = 1 if rhs is None or rhs.ndim == 1 else rhs.shape[1]
+    _mkl().pardiso(
+        pointer(handle), integer(1), integer(1), integer(matrix_type), integer(phase), integer(rows.size),
+        pointer(rows.values), pointer(rows.indptr), pointer(rows.indices), None, integer(columns),
+        pointer(parameters), integer(0), pointer(rhs), pointer(solution), ctypes.byref(error),
+    )  # fmt: skip
+    return error.value
+
+
+@functools.cache
+def _mkl_path() -> Path | None:
+    """Return MKL's run-time library as the distribution ``mkl`` (or a conda environment) holds it, or None."""
+    try:
+        found = [Path(str(f.locate())) for f in importlib.metadata.files("mkl") or () if "mkl_rt" in f.name]
+    except importlib.metadata.PackageNotFoundError:
+        prefix = Path(sys.prefix)
+        found = [*prefix.glob("lib/libmkl_rt*"), *prefix.glob("Library/bin/mkl_rt*.dll")]
+    found = [path for path in found if path.exists() and path.suffix != ".lib"]
+    return found[0] if found else None
+
+
+@functools.cache
+def _mkl() -> ctypes.CDLL:
+    """Load MKL: one thread, 32-bit indices, and the same bits whatever the alignment of the arrays."""
+    library = ctypes.CDLL(str(_mkl_path()))
+    library.MKL_Set_Threading_Layer(1)  # sequential
+    library.MKL_Set_Interface_Layer(0)  # LP64
+    library.MKL_CBWR_Set(2)  # conditional numerical reproducibility: the best branch of this machine, always
+    return library
