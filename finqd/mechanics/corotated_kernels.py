@@ -18,6 +18,8 @@ Arrays of a block: nodes (n, k) scene vertex ids; rest (n, k, 3) centred rest po
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -287,11 +289,29 @@ def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, smal
     _products(kq, q_columns, v)
     for i in range(3):
         for j in range(i + 1):
-            w3[i, j] = w3[j, i] = w[i, j] - v[i, j] - v[j, i] - 0.5 * (w3[i, j] + w3[j, i])
+            v[i, j] = v[j, i] = v[i, j] + v[j, i]
+    size = 0.0
+    for i in range(3):
+        for j in range(3):
+            w[i, j] -= v[i, j]
+            size += w[i, j] * w[i, j]
+    trace = w3[0, 0] + w3[1, 1] + w3[2, 2]
+    share = 1.0  # of the coupling Q that is kept
+    if trace * trace > 3.0 * size:
+        share = math.sqrt(math.sqrt(3.0 * size) / trace)
+        for i in range(3):
+            for n in range(3 * k):
+                q_columns[i, n] *= share
+    for i in range(3):
+        for j in range(i + 1):
+            coupled = share * share * 0.5 * (w3[i, j] + w3[j, i])
+            w3[i, j] = w3[j, i] = w[i, j] - coupled
+    for i in range(3):
+        for j in range(3):
+            w[i, j] += share * v[i, j]
     minor = w3[0, 0] * w3[1, 1] - w3[0, 1] * w3[1, 0]
-    if w3[0, 0] > 0.0 and minor > 0.0:
-        if _invert(w3, v) > 0.0:
-            return
+    if w3[0, 0] > 0.0 and minor > 0.0 and _invert(w3, v) > 0.0:
+        return
     symmetric_eigen(w3, v)
     for n in range(3):
         if w3[n, n] < 0.0:
