@@ -133,7 +133,7 @@ class ContactPotential(Protocol):
         """Fix what is lagged over a step (reference points, normals, friction bounds) at its start."""
 
     def relag(self, state: State) -> float:
-        """Renew the friction bounds at ``state``; return the largest change [N]."""
+        """Renew the friction bounds at ``state``; return which share of them, in sum, has changed (0 to 2)."""
 
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J]."""

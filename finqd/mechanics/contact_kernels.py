@@ -238,19 +238,20 @@ def near_triangles(positions, faces, triangle_face, points, reach, low, high, pa
 @njit(cache=True)
 def find_feature_soft(
     positions, faces, triangle_face, triangle_weight, pairs, points, feature_stiffness, centre, rotation, rigid,
-    first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+    first_key, depth, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
 ):
     """Append the features of a rigid body that lie inside a soft body; return the new count.
 
-    pairs: candidate (point, triangle) sorted by point, then soft body; shape (n, 3): point, triangle, soft body. The
-    gap of a point to a body is the signed distance to the nearest triangle; where several are equally near (an edge),
-    the one that faces the point most decides the sign.
+    pairs: candidate (point, triangle) of one soft body, sorted by point; shape (n, 2). The gap of a point is the signed
+    distance to the nearest triangle; where several are equally near (an edge), the one that faces the point most
+    decides the sign. Points deeper than ``depth`` [m] are left out: they are nearer to the wall's other side.
     """
-    p, arm, bary, corner, cp, best_n = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
+    p, arm, bary, cp, best_n = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    corner, best_weight = np.empty((3, 3)), np.empty(faces.shape[1])
     i0 = 0
     while i0 < pairs.shape[0]:
         i1 = i0
-        while i1 < pairs.shape[0] and pairs[i1, 0] == pairs[i0, 0] and pairs[i1, 2] == pairs[i0, 2]:
+        while i1 < pairs.shape[0] and pairs[i1, 0] == pairs[i0, 0]:
             i1 += 1
         q = pairs[i0, 0]
         for i in range(3):
@@ -274,20 +275,19 @@ def find_feature_soft(
             if distance < best - 1e-9 or (distance < best + 1e-9 and facing > best_facing):
                 best, best_facing, best_t = distance, facing, t
                 best_gap = distance if height > 0.0 else -distance
-                if count < out_key.shape[0]:
-                    # weights of the closest point on the face, through the triangle's corners
-                    for a in range(nodes.shape[0]):
-                        out_weight[count, a] = (
-                            bary[0] * triangle_weight[t, 0, a] + bary[1] * triangle_weight[t, 1, a]
-                            + bary[2] * triangle_weight[t, 2, a]
-                        )
+                for a in range(nodes.shape[0]):
+                    best_weight[a] = (
+                        bary[0] * triangle_weight[t, 0, a] + bary[1] * triangle_weight[t, 1, a]
+                        + bary[2] * triangle_weight[t, 2, a]
+                    )
                 if facing > 0.999999:
                     best_n[:] = n
                 else:
                     best_n[:] = delta / best_gap
-        if best_gap < 0.0:
+        if -depth < best_gap < 0.0:
             out_key[count] = first_key + q
             out_face[count] = triangle_face[best_t]
+            out_weight[count] = best_weight
             out_gap[count] = best_gap
             out_normal[count] = -best_n
             out_arm[count] = arm

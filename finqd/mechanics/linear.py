@@ -108,12 +108,14 @@ class CoupledInverse:
     def __init__(self, factorisation: Factorisation, matrix: CoupledMatrix) -> None:
         """Factorise ``matrix``; raises ``numpy.linalg.LinAlgError`` if it is singular."""
         self._factorisation = factorisation
-        self.positive = factorisation.factorise(matrix.blocks)
+        # a scene without soft bodies has nothing to factorise
+        self.positive = factorisation.factorise(matrix.blocks) if len(matrix.blocks) else True
         self._size = len(matrix.coupling)
         self._eliminated = np.zeros(matrix.coupling.shape)
         self._schur_inverse = np.zeros((0, 0))
         if matrix.coupling.shape[1]:
-            self._eliminated = np.ascontiguousarray(factorisation.solve(matrix.coupling))
+            if len(matrix.coupling):
+                self._eliminated = np.ascontiguousarray(factorisation.solve(matrix.coupling))
             schur = matrix.rigid - matrix.coupling.T @ self._eliminated
             self._schur_inverse, definite = _symmetric_inverse(0.5 * (schur + schur.T))
             self.positive = self.positive and definite
@@ -126,7 +128,8 @@ class CoupledInverse:
         """See `Preconditioner`."""
         soft, rigid = residual[: self._size], residual[self._size :]
         result = np.empty(len(residual))
-        result[: self._size] = self._factorisation.solve(soft)
+        if len(soft):
+            result[: self._size] = self._factorisation.solve(soft)
         if len(rigid):
             carried = np.empty(len(rigid))
             transposed_product(self._eliminated, soft, carried)

@@ -48,6 +48,8 @@ class BlockPattern:
         Raises KeyError if a pair is not in the pattern.
         """
         nodes = np.asarray(nodes, dtype=np.int64)
+        if not nodes.size:
+            return np.zeros((*nodes.shape, nodes.shape[-1]), dtype=np.int32)
         rows = np.repeat(np.arange(self.n_vertices, dtype=np.int64), np.diff(self.indptr))
         key = rows * self.n_vertices + self.indices
         wanted = nodes[:, :, None] * self.n_vertices + nodes[:, None, :]

@@ -1,0 +1,88 @@
+"""Rows of contacts and of frictional contacts, as `finqd.mechanics.contact_kernels` fills and reads them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from finqd.mechanics.state import State
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrictionRows:
+    """Frictional contacts of one step, with their lagged bounds; n rows.
+
+    key, face, rigid: (n,); weight: (n, k); bound: mu N [N], stiffness: tangential [N/m], (n,)
+    normal, start_point [m], start_arm [m], start_slip [m]: (n, 3), the last three at the start of the step
+    """
+
+    key: np.ndarray
+    face: np.ndarray
+    weight: np.ndarray
+    rigid: np.ndarray
+    bound: np.ndarray
+    stiffness: np.ndarray
+    normal: np.ndarray
+    start_point: np.ndarray
+    start_arm: np.ndarray
+    start_slip: np.ndarray
+
+    @classmethod
+    def empty(cls, width: int) -> FrictionRows:
+        """Return no rows, for faces of up to ``width`` vertices."""
+        ids, three = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        return cls(
+            key=ids, face=ids, weight=np.zeros((0, width)), rigid=ids, bound=np.zeros(0), stiffness=np.zeros(0),
+            normal=three, start_point=three, start_arm=three, start_slip=three,
+        )
+
+
+class Rows:
+    """Contacts at one state: ``count`` of at most ``capacity`` rows are in use; see `contact_kernels` for the columns."""
+
+    def __init__(self, capacity: int, width: int) -> None:
+        self.count = 0
+        self.key = np.zeros(capacity, dtype=np.int64)
+        self.face = np.zeros(capacity, dtype=np.int64)
+        self.weight = np.zeros((capacity, width))
+        self.gap = np.zeros(capacity)
+        self.normal = np.zeros((capacity, 3))
+        self.arm = np.zeros((capacity, 3))
+        self.stiffness = np.zeros(capacity)
+        self.rigid = np.zeros(capacity, dtype=np.int64)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """All columns, in the order in which kernels take them."""
+        return self.key, self.face, self.weight, self.gap, self.normal, self.arm, self.stiffness, self.rigid
+
+    def forces(self, smoothing: float) -> np.ndarray:
+        """Return the normal forces [N], shape (count,); see `contact_kernels.normal_force`."""
+        depth, stiffness = -self.gap[: self.count], self.stiffness[: self.count]
+        return stiffness * np.where(depth < smoothing, depth**2 / (2.0 * smoothing), depth - 0.5 * smoothing)
+
+    def friction(
+        self, *, state: State, start: State, faces: np.ndarray, bounds: np.ndarray, slips: np.ndarray, ratio: float
+    ) -> FrictionRows:
+        """Return the frictional contacts among the rows found at ``state``, referred to ``start``.
+
+        bounds: lagged mu N [N] by key; slips: stored elastic slip [m] by key, in the frame of the rigid body;
+        ratio: tangential over normal stiffness.
+        """
+        used = np.flatnonzero(bounds[self.key[: self.count]] > 0.0)
+        key, face, rigid, weight = self.key[used], self.face[used], self.rigid[used], self.weight[used]
+        point = np.zeros((len(used), 3))
+        soft = face >= 0
+        nodes = faces[face[soft]]
+        point[soft] = np.einsum("na,nax->nx", np.where(nodes >= 0, weight[soft], 0.0), start.positions[nodes])
+        arm, slip = self.arm[used], slips[key]
+        for r in range(len(start.rigid_positions)):
+            mine = rigid == r
+            then = start.rigid_rotations[r]
+            arm[mine] = arm[mine] @ (then @ state.rigid_rotations[r].T).T
+            slip[mine] = slip[mine] @ then.T
+        return FrictionRows(
+            key=key, face=face, weight=weight, rigid=rigid, bound=bounds[key], stiffness=ratio * self.stiffness[used],
+            normal=self.normal[used], start_point=point, start_arm=arm, start_slip=slip,
+        )

@@ -1,0 +1,140 @@
+"""Stepper ``implicit_euler``: Newton's method with line search on the incremental potential."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+from finqd.mechanics.incremental import EulerIncrement
+from finqd.mechanics.linear import LinearSolution, make_solver
+from finqd.mechanics.state import Direction, State, StepReport
+from finqd.mechanics.system import System
+
+ARMIJO = 1e-4  # share of the linear decrease that a step must reach (Nocedal and Wright, Numerical Optimization, 3.1)
+SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
+ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImplicitEuler:
+    """First order implicit Euler: every step minimises inertia plus elasticity, contact and friction by Newton's method.
+
+    tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step
+    max_iterations: Newton iterations after which a step is given up (and halved)
+    max_friction_updates: how often the friction bounds are renewed within a step
+    friction_tolerance: share of the friction bounds that may change without a renewal
+    linear_solver, preconditioner, backend: see `finqd.mechanics.linear`
+    linear_tolerance: relative residual of the linear solves
+    linear_iterations: cap on CG iterations
+    """
+
+    tolerance_N: Annotated[float, Gt(0), Le(1)] = 1e-5
+    max_iterations: Annotated[int, Ge(1), Le(1000)] = 40
+    max_friction_updates: Annotated[int, Ge(0), Le(100)] = 4
+    friction_tolerance: Annotated[float, Gt(0), Le(1)] = 0.02
+    linear_solver: Literal["cg", "direct"] = "cg"
+    preconditioner: Literal["factorisation", "block_jacobi", "jacobi"] = "factorisation"
+    backend: Literal["auto", "pardiso", "cholmod", "qdldl", "superlu"] = "auto"
+    linear_tolerance: Annotated[float, Gt(0), Lt(1)] = 1e-3
+    linear_iterations: Annotated[int, Ge(1), Le(1_000_000)] = 1000
+
+    def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:
+        """Return the state after ``dt`` [s], or ``state`` itself and the reason."""
+        report = StepReport(residuals=[])
+        system.contact.begin_step(state)
+        increment = EulerIncrement(system, state, dt)
+        trial = self._minimise(system, increment, increment.predicted(), report)
+        if not report.converged:
+            return state, report
+        end = increment.finished(trial)
+        system.contact.commit(end)
+        return end, report
+
+    def _minimise(self, system: System, increment: EulerIncrement, trial: State, report: StepReport) -> State:
+        """Run Newton's method from ``trial``; ``report`` says how it went."""
+        energy = increment.derive(trial, hessian=False)
+        while True:
+            report.residual, report.where = system.residual()
+            report.residuals.append(report.residual)
+            if not np.isfinite(report.residual) or not np.isfinite(energy):
+                report.reason = f"the forces are no longer finite ({report.where})"
+                return trial
+            # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
+            if report.residual <= self.tolerance_N and (report.iterations or report.residual <= 1e-3 * self.tolerance_N):
+                if report.friction_updates >= self.max_friction_updates:
+                    break
+                if system.contact.relag(trial) <= self.friction_tolerance:
+                    break
+                report.friction_updates += 1
+                energy = increment.derive(trial, hessian=False)
+                continue
+            if report.iterations >= self.max_iterations:
+                report.reason = (
+                    f"no equilibrium after {report.iterations} iterations: {report.residual:.3g} N left on {report.where}"
+                )
+                return trial
+            report.iterations += 1
+            moved = self._iterate(system, increment, trial, report)
+            if moved is None:
+                return trial
+            trial = moved
+            energy = increment.derive(trial, hessian=False)
+        report.converged = True
+        return trial
+
+    def _iterate(self, system: System, increment: EulerIncrement, trial: State, report: StepReport) -> State | None:
+        """Do one Newton iteration; None if no direction leads downhill."""
+        for projected in (False, True):
+            energy = increment.derive(trial, hessian=True, projected=projected)
+            solution = self._solve(system, report)
+            direction = Direction(soft=solution.soft, rigid=solution.rigid)
+            d = system.derivatives
+            slope = float(np.vdot(d.soft, direction.soft) + np.vdot(d.rigid, direction.rigid))
+            if solution.definite and slope < 0.0:
+                moved = self._search(system, increment, trial, energy, direction, slope, report)
+                if moved is not None:
+                    return moved
+            report.projections += 1
+        report.reason = f"the line search found no descent: {report.residual:.3g} N left on {report.where}"
+        return None
+
+    def _solve(self, system: System, report: StepReport) -> LinearSolution:
+        key = (self.linear_solver, self.preconditioner, self.backend, self.linear_iterations)
+        if key not in system.solvers:
+            system.solvers[key] = make_solver(
+                system.pattern, method=self.linear_solver, preconditioner=self.preconditioner, backend=self.backend,
+                max_iterations=self.linear_iterations, tolerance=self.linear_tolerance,
+            )
+        d = system.derivatives
+        solution = system.solvers[key].solve(
+            d.blocks, d.coupling, d.rigid_matrix, -d.soft, -d.rigid, tolerance=self.linear_tolerance
+        )
+        report.cg_iterations += solution.iterations
+        report.factorisations += int(solution.factorised)
+        return solution
+
+    def _search(
+        self, system: System, increment: EulerIncrement, trial: State, energy: float, direction: Direction, slope: float,
+        report: StepReport,
+    ) -> State | None:
+        """Backtrack until Armijo's condition holds, by the parabola through both energies and the slope."""
+        share = system.contact.step_limit(trial, direction)
+        slack = ROUNDING * (abs(energy) + increment.scale)
+        while share > SHORTEST:
+            moved = trial.moved(direction, share)
+            found = increment.energy(moved)
+            if found <= energy + ARMIJO * share * slope + slack:
+                return moved
+            report.line_searches += 1
+            curvature = found - energy - share * slope
+            best = -0.5 * slope * share * share / curvature if np.isfinite(curvature) and curvature > 0.0 else 0.0
+            share = min(max(best, 0.1 * share), 0.5 * share)
+        return None
+
+
+def without_damping(stepper: ImplicitEuler) -> ImplicitEuler:
+    """Return the stepper with the tightest tolerance that double precision carries, for conservation laws."""
+    return replace(stepper, tolerance_N=1e-10, linear_tolerance=1e-12)
