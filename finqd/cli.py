@@ -127,7 +127,7 @@ def optimise(
     base = None if design is None else _read_design(design)
     run(
         iterations=iterations, batch=batch, objects=_split(object_names) or None, jobs=jobs, seed=seed,
-        out=usable_folder(out, "--out"), preset=preset, design=base,
+        out=usable_folder(out, "--out"), preset=preset, base_design=base,
     )
 
 
