@@ -1,0 +1,92 @@
+"""The swept mesher: quadrilaterals in the profile, hexahedra along the thickness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Le
+
+from finqd.errors import MeshError
+from finqd.mesh import Mesh
+from finqd.mesh_sets import with_finger_sets
+from finqd.plugins.swept_patches import PlaneMesh, corner_sines, mesh_patches
+from finqd.solid import Patch, Prism, Solid
+from finqd.units import MM
+
+_GOOD_ENOUGH = 0.1  # sine of the worst corner above which no second mesh is tried
+_LAYER = 1.25  # layers are that much longer than the size: bending leaves the thickness almost straight
+_CORNER = np.radians(150.0)  # a profile's corner below this angle is a corner of its patch
+
+
+@dataclass(frozen=True, kw_only=True)
+class Swept:
+    """Quadrilaterals in a prism's profile, swept along its thickness: hexahedra, and wedges where triangles remain.
+
+    ``size_mm``: edge length aimed at in the profile; ``layers``: elements along the thickness, null for
+    thickness / (1.25 size), at least 2; ``least_edges``: elements through a wall at least. A profile that comes in
+    patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by interpolation, without
+    wedges; any other by gmsh.
+    """
+
+    size_mm: Annotated[float, Ge(0.2), Le(50)] = 4.0
+    layers: Annotated[int, Ge(1), Le(200)] | None = None
+    least_edges: Annotated[int, Ge(1), Le(10)] = 1
+
+    def mesh(self, solid: Solid) -> Mesh:
+        """Return the mesh of ``solid``; raises ``MeshError`` (``finqd.contracts.Mesher``)."""
+        if not isinstance(solid, Prism):
+            raise MeshError("the swept mesher takes prisms only; use the mesher 'tetrahedral' for other solids")
+        plane = self._plane(solid)
+        worst = plane.worst()
+        if worst <= 0:
+            raise MeshError(f"the profile's best mesh has a turned element (sine of its corner {worst:.2g})")
+        return with_finger_sets(self._sweep(plane, solid.thickness), solid.contact_line)
+
+    def _plane(self, solid: Prism) -> PlaneMesh:
+        patches = solid.patches or _single_patch(solid)
+        first = None
+        if patches:
+            try:
+                first = mesh_patches(patches, self.size_mm * MM, self.least_edges)
+            except MeshError:
+                first = None  # the second way may still do
+            if first and first.worst() >= _GOOD_ENOUGH:
+                return first
+        from finqd.plugins.swept_paving import pave
+
+        second = pave(solid, self.size_mm * MM, self.least_edges)
+        return first if first and first.worst() >= second.worst() else second
+
+    def _sweep(self, plane: PlaneMesh, thickness: float) -> Mesh:
+        layers = self.layers or max(2, int(thickness / (_LAYER * self.size_mm * MM)))
+        levels = np.linspace(-0.5 * thickness, 0.5 * thickness, layers + 1)
+        count = len(plane.points)
+        vertices = np.empty((count, layers + 1, 3))
+        vertices[..., :2] = plane.points[:, None]
+        vertices[..., 2] = levels
+        blocks = {}
+        for kind, elements in (("hex8", plane.quads), ("wedge6", plane.triangles)):
+            if len(elements):
+                lower = elements[:, None, :] * (layers + 1) + np.arange(layers)[None, :, None]
+                blocks[kind] = np.concatenate([lower, lower + 1], axis=-1).reshape(-1, 2 * elements.shape[1])
+        return Mesh(vertices.reshape(-1, 3), blocks)
+
+
+def _single_patch(solid: Prism) -> tuple[Patch, ...] | None:
+    """Return a profile without holes as one patch, if it has three or four corners."""
+    if solid.holes:
+        return None
+    ring = np.asarray(solid.outer, dtype=float)
+    sines = corner_sines(ring)
+    after, before = np.roll(ring, -1, axis=0) - ring, np.roll(ring, 1, axis=0) - ring
+    angles = np.arctan2(sines, np.sum(after * before, axis=1) / np.linalg.norm(after, axis=1)
+                        / np.linalg.norm(before, axis=1))
+    corners = np.flatnonzero((angles > 0) & (angles < _CORNER))
+    if len(corners) not in (3, 4):
+        return None
+    ring = np.roll(ring, -corners[0], axis=0)
+    stops = [*(corners - corners[0]), len(ring)]
+    closed = np.concatenate([ring, ring[:1]])
+    return (tuple(closed[a : b + 1] for a, b in zip(stops, stops[1:], strict=False)),)

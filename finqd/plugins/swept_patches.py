@@ -1,0 +1,207 @@
+"""Quadrilaterals in a profile that comes as three- and four-sided patches.
+
+How many edges a segment of a patch's rim gets is an integer program: as near as possible to length / size, opposite
+sides of a four-sided patch equal, the three sides of a triangle such that it falls into three four-sided ones (midpoint
+subdivision). Nodes inside a patch come from transfinite interpolation between its sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from finqd.errors import MeshError
+from finqd.solid import Patch
+
+_SAME_POINT = 1e-9  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneMesh:
+    """Nodes [m] (n, 2), quadrilaterals (m, 4) and triangles (k, 3), counter-clockwise."""
+
+    points: np.ndarray
+    quads: np.ndarray
+    triangles: np.ndarray
+
+    def worst(self) -> float:
+        """Return the smallest sine of an element's corner angle, negative if it is turned over."""
+        return min(float(corner_sines(self.points[e]).min()) for e in (self.quads, self.triangles) if len(e))
+
+
+def corner_sines(corners: np.ndarray) -> np.ndarray:
+    """Return the sines of the corner angles of polygons (..., n, 2), shape (..., n)."""
+    after = np.roll(corners, -1, axis=-2) - corners
+    before = np.roll(corners, 1, axis=-2) - corners
+    cross = after[..., 0] * before[..., 1] - after[..., 1] * before[..., 0]
+    scale = np.linalg.norm(after, axis=-1) * np.linalg.norm(before, axis=-1)
+    return cross / np.maximum(scale, np.finfo(float).tiny)
+
+
+def mesh_patches(patches: Sequence[Patch], size: float, least: int) -> PlaneMesh:
+    """Return the mesh of a profile in patches, edges about ``size`` [m], at least ``least`` a segment.
+
+    Raises ``MeshError`` if no numbers of edges fit together.
+    """
+    points, sides = _numbered(patches)
+    segments: dict[tuple[int, int], int] = {}
+    for patch in sides:
+        for side in patch:
+            for a, b in zip(side, side[1:], strict=False):
+                segments.setdefault((min(a, b), max(a, b)), len(segments))
+    pairs = np.array(list(segments))
+    lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    rims = [[[segments[min(a, b), max(a, b)] for a, b in zip(s, s[1:], strict=False)] for s in p] for p in sides]
+    counts = edge_counts(rims, np.maximum(lengths / size, least), least)
+    return _Builder(points, pairs, counts).mesh(sides, segments)
+
+
+def _numbered(patches: Sequence[Patch]) -> tuple[np.ndarray, list[list[list[int]]]]:
+    """Return the distinct points (n, 2) and the patches' sides as lists of point ids."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    flat = np.concatenate([side for patch in patches for side in patch])
+    near = cKDTree(flat).query_pairs(_SAME_POINT, output_type="ndarray")
+    links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(flat), len(flat)))
+    count, ids = connected_components(links, directed=False)
+    _, first = np.unique(ids, return_index=True)
+    sides, start = [], 0
+    for patch in patches:
+        sides.append([])
+        for side in patch:
+            sides[-1].append(ids[start : start + len(side)].tolist())
+            start += len(side)
+    return flat[first], sides
+
+
+def edge_counts(rims: Sequence[Sequence[Sequence[int]]], wanted: np.ndarray, least: int) -> np.ndarray:
+    """Return the number of edges of each segment, as near to ``wanted`` (n,) as the patches allow.
+
+    rims: the segments of each side of each patch. Minimises sum |n_s - w_s| / w_s subject to the sides' balance.
+    """
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import coo_array
+
+    n = len(wanted)
+    rows, columns, values, n_rows, n_columns = [], [], [], 0, 2 * n
+
+    def equation(*terms: tuple[Sequence[int], float]) -> None:
+        nonlocal n_rows
+        for indices, value in terms:
+            rows.extend([n_rows] * len(indices))
+            columns.extend(indices)
+            values.extend([value] * len(indices))
+        n_rows += 1
+
+    for rim in rims:
+        if len(rim) == 4:
+            equation((rim[0], 1.0), (rim[2], -1.0))
+            equation((rim[1], 1.0), (rim[3], -1.0))
+        else:  # corner i owns the count of the side opposite to it, split in two
+            for i in range(3):
+                equation((rim[i], 1.0), ([n_columns + i, n_columns + (i + 1) % 3], -1.0))
+            n_columns += 3
+    equal_rows = n_rows
+    for s in range(n):  # slack n + s bounds |n_s - w_s|
+        equation(([s], 1.0), ([n + s], -1.0))
+        equation(([s], -1.0), ([n + s], -1.0))
+    upper = np.concatenate([np.zeros(equal_rows), np.column_stack([wanted, -wanted]).ravel()])
+    lower = np.concatenate([np.zeros(equal_rows), np.full(2 * n, -np.inf)])
+    matrix = coo_array((values, (rows, columns)), shape=(n_rows, n_columns)).tocsr()
+    cost, integral, floor = np.zeros(n_columns), np.ones(n_columns), np.ones(n_columns)
+    cost[n : 2 * n], integral[n : 2 * n], floor[n : 2 * n], floor[:n] = 1.0 / wanted, 0.0, 0.0, least
+    result = milp(cost, integrality=integral, bounds=Bounds(floor, np.inf),
+                  constraints=LinearConstraint(matrix, lower, upper), options={"time_limit": 20.0})
+    if result.x is None:
+        raise MeshError(f"no numbers of edges fit the profile's patches ({result.message})")
+    return np.rint(result.x[:n]).astype(int)
+
+
+class _Builder:
+    """Collects nodes and quadrilaterals, patch by patch."""
+
+    def __init__(self, points: np.ndarray, pairs: np.ndarray, counts: np.ndarray) -> None:
+        self.points = [np.asarray(points)]
+        self.n_points = len(points)
+        self.quads: list[np.ndarray] = []
+        self.inner = []
+        for (a, b), count in zip(pairs, counts, strict=True):
+            share = np.arange(1, count)[:, None] / count
+            self.inner.append(self._add(points[a] + share * (points[b] - points[a])))
+
+    def mesh(self, sides: list[list[list[int]]], segments: dict[tuple[int, int], int]) -> PlaneMesh:
+        for patch in sides:
+            rim = [self._side(side, segments) for side in patch]
+            if len(rim) == 4:
+                self._grid(*rim)
+            else:
+                self._triangle(*rim)
+        return PlaneMesh(np.concatenate(self.points), np.concatenate(self.quads), np.empty((0, 3), dtype=int))
+
+    def _add(self, points: np.ndarray) -> np.ndarray:
+        ids = np.arange(self.n_points, self.n_points + len(points))
+        self.points.append(points)
+        self.n_points += len(points)
+        return ids
+
+    def _side(self, corners: list[int], segments: dict[tuple[int, int], int]) -> np.ndarray:
+        nodes = [np.array(corners[:1])]
+        for a, b in zip(corners, corners[1:], strict=False):
+            inner = self.inner[segments[min(a, b), max(a, b)]]
+            nodes += [inner if a < b else inner[::-1], np.array([b])]
+        return np.concatenate(nodes)
+
+    def _grid(self, bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndarray) -> None:
+        """Fill a four-sided patch, its sides' node ids in counter-clockwise order (discrete Coons patch)."""
+        top, left = top[::-1], left[::-1]
+        columns, rows = len(bottom), len(left)
+        points = self._all()
+        u = np.linspace(0.0, 1.0, columns)[None, :, None]
+        v = np.linspace(0.0, 1.0, rows)[:, None, None]
+        surface = (1 - v) * points[bottom][None] + v * points[top][None]
+        surface = surface + (1 - u) * points[left][:, None] + u * points[right][:, None]
+        b0, b1, t0, t1 = points[bottom[0]], points[bottom[-1]], points[top[0]], points[top[-1]]
+        surface = surface - (1 - u) * (1 - v) * b0 - u * (1 - v) * b1 - (1 - u) * v * t0 - u * v * t1
+        ids = np.empty((rows, columns), dtype=int)
+        ids[0], ids[-1], ids[:, 0], ids[:, -1] = bottom, top, left, right
+        ids[1:-1, 1:-1] = self._add(surface[1:-1, 1:-1].reshape(-1, 2)).reshape(rows - 2, columns - 2)
+        self.quads.append(np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4))
+
+    def _triangle(self, *sides: np.ndarray) -> None:
+        """Fill a three-sided patch by three grids that meet in a point inside it."""
+        counts = np.array([len(side) - 1 for side in sides])
+        first = [int(counts[i] + counts[(i + 1) % 3] - counts[(i + 2) % 3]) // 2 for i in range(3)]
+        # side i is split after first[i] edges; the middle nodes and the centre bound the three grids
+        middle = [side[k] for side, k in zip(sides, first, strict=True)]
+        points = self._all()
+        centre = self._add(_centre(points[[side[0] for side in sides]], points[middle])[None])[0]
+        spokes = []
+        for i in range(3):
+            edges = counts[i - 1] - first[i - 1]
+            share = np.arange(1, edges)[:, None] / edges
+            inner = self._add(points[middle[i]] + share * (self._all()[centre] - points[middle[i]]))
+            spokes.append(np.concatenate([[middle[i]], inner, [centre]]))
+        for i in range(3):
+            start, end = sides[i][: first[i] + 1], sides[i - 1][first[i - 1] :]
+            self._grid(start, spokes[i], spokes[i - 1][::-1], end)
+
+    def _all(self) -> np.ndarray:
+        if len(self.points) > 1:
+            self.points = [np.concatenate(self.points)]
+        return self.points[0]
+
+
+def _centre(corners: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Return the point in a triangle whose three grids have the best worst corner; ``middle`` (3, 2): on its sides."""
+    steps = np.array([(i, j, 20 - i - j) for i in range(1, 19) for j in range(1, 20 - i)]) / 20.0
+    tried = steps @ corners
+    worst = np.full(len(tried), np.inf)
+    for i in range(3):
+        fixed = np.broadcast_to(np.array([corners[i], middle[i], corners[i], middle[i - 1]]), (len(tried), 4, 2)).copy()
+        fixed[:, 2] = tried
+        worst = np.minimum(worst, corner_sines(fixed).min(axis=1))
+    return tried[int(np.argmax(worst))]
