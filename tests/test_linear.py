@@ -208,6 +208,18 @@ def test_the_same_input_gives_the_same_bits(options):
     assert results[0].tobytes() == results[1].tobytes()
 
 
+@pytest.mark.parametrize("options", SOLVERS, ids=lambda o: "-".join(o.values()))
+def test_a_scene_of_rigid_bodies_alone_is_solved(options):
+    pattern = BlockPattern.from_cliques(0, [])
+    factor = np.random.default_rng(0).normal(size=(6, 6))
+    rigid, rhs = factor @ factor.T + np.eye(6), np.arange(6.0)
+    solution = make_solver(pattern, tolerance=1e-12, **options).solve(
+        np.zeros((0, 3, 3)), np.zeros((0, 6)), rigid, np.zeros((0, 3)), rhs.reshape(1, 6)
+    )
+    assert solution.converged and solution.definite and solution.rigid.shape == (1, 6)
+    np.testing.assert_allclose(solution.rigid.reshape(-1), np.linalg.solve(rigid, rhs), rtol=1e-8, atol=1e-10)
+
+
 def test_a_zero_right_hand_side_gives_zero():
     system = System(1)
     system.rhs_soft[:] = 0.0

@@ -245,7 +245,6 @@ class _Pardiso:
     """
 
     def __init__(self, rows: Rows, matrix_type: int) -> None:
-        self._rows, self._type = rows, matrix_type
         self._handle = np.zeros(64, np.int64)
         self.parameters = np.zeros(64, np.int32)
         self.parameters[0] = 1  # take the values below, no defaults
@@ -254,16 +253,14 @@ class _Pardiso:
         self.parameters[17] = -1  # report the entries of the factor
         self.parameters[20] = 1  # Bunch-Kaufman pivots
         self.parameters[34] = 1  # indices from zero
-        self._analysed = False
-        arguments = (self._handle, self.parameters, rows, matrix_type)
-        self._release = weakref.finalize(self, _call_pardiso, -1, *arguments)
-        self._arguments = arguments
+        self._arguments = (self._handle, self.parameters, rows, matrix_type)
+        self._release: weakref.finalize | None = None
 
     def factorise(self) -> bool:
         """Factorise the current values of the rows; False if a pivot has the wrong sign or is zero."""
-        if not self._analysed:
+        if self._release is None:
+            self._release = weakref.finalize(self, _call_pardiso, -1, *self._arguments)
             _check(_call_pardiso(11, *self._arguments))
-            self._analysed = True
         error = _call_pardiso(22, *self._arguments)
         if error == -4:
             return False
