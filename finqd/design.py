@@ -35,6 +35,7 @@ from finqd.design_schema import (
     FINGER_COUNT,
     KEYS,
     SPACING,
+    TEXTS,
     MaterialSection,
     constants,
     design_schema,
@@ -109,8 +110,8 @@ class Design:
         return {key: full[key] for key in KEYS if key in full}
 
     def digest(self) -> str:
-        """Return a hash (SHA-256, hex) of all that is simulated: of `resolved`, without the name."""
-        content = {key: value for key, value in self.resolved().items() if key != "name"}
+        """Return a hash (SHA-256, hex) of all that is simulated: of `resolved`, without name and description."""
+        content = {key: value for key, value in self.resolved().items() if key not in TEXTS}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @staticmethod

@@ -24,7 +24,8 @@ def split_path(path: str, *, place: str) -> list[str | int]:
         steps.append(match[1] if match[1] is not None else int(match[2]))
         position = match.end()
     if not steps or position < len(path) or not isinstance(steps[0], str) or path.startswith("."):
-        raise InputError(f"this is no path such as protocol.hold_s or fingers[1].rib_count: {shown(path)}", place)
+        text = f"this is no path such as protocol.hold_s or fingers[1].rib_count: {shown(path)}"
+        raise InputError(text, place.rstrip(":"))
     return steps
 
 
@@ -54,7 +55,8 @@ def _override_fingers(document: dict[str, Any], first: str, rest: list[str | int
         document[first] = value
         return
     if "finger" in document:
-        document["fingers"] = [dict(document.pop("finger")) for _ in range(FINGER_COUNT)]
+        finger = document.pop("finger")
+        document["fingers"] = [dict(finger) for _ in range(FINGER_COUNT)]
     if first == "fingers":
         _put(document["fingers"], rest, value, join(place, first))
         return

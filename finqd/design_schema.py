@@ -36,7 +36,10 @@ DEFAULT_PLUGINS: dict[str, Any] = {
 }
 
 #: keys of a design file, in the order in which they are written
-KEYS = ("name", "geometry", "finger", "fingers", "spacing_mm", "material", *DEFAULT_PLUGINS, "protocol")
+KEYS = ("name", "description", "geometry", "finger", "fingers", "spacing_mm", "material", *DEFAULT_PLUGINS, "protocol")
+
+#: texts that a design file may hold, and how long they may be; they change nothing
+TEXTS = {"name": 100, "description": 1000}
 
 
 def _constant(default: float, description: str) -> Any:
@@ -69,8 +72,9 @@ def read_document(document: Mapping[str, Any], place: str) -> tuple[dict[str, An
     document = {key: value for key, value in document.items() if key != "$schema"}
     refuse_unknown(document, KEYS, place)
     read: dict[str, Any] = {}
-    if "name" in document:
-        read["name"] = _read_name(document["name"], join(place, "name"))
+    for key, length in TEXTS.items():
+        if key in document:
+            read[key] = _read_text(document[key], length, join(place, key))
     if "geometry" not in document:
         known = ", ".join(registry.names("geometry"))
         raise InputError(f"missing; must name a geometry plugin (known: {known})", join(place, "geometry"))
@@ -123,9 +127,9 @@ def constants(owner: MaterialSection | GraspProtocol) -> dict[str, float]:
     return asdict(owner)
 
 
-def _read_name(value: Any, where: str) -> str:
-    if not (isinstance(value, str) and 0 < len(value) <= 100 and value.isprintable() and value.strip()):
-        raise InputError(f"must be a text of 1 to 100 printable characters, not {shown(value)}", where)
+def _read_text(value: Any, length: int, where: str) -> str:
+    if not (isinstance(value, str) and 0 < len(value) <= length and value.isprintable() and value.strip()):
+        raise InputError(f"must be a text of 1 to {length} printable characters, not {shown(value)}", where)
     return value
 
 
@@ -222,7 +226,7 @@ def design_schema(geometry: str = "fin_ray") -> dict[str, Any]:
     finger = _object_schema({p.key: parameter_schema(p) for p in parameters}, required=[p.key for p in parameters])
     properties: dict[str, Any] = {
         "$schema": {"type": "string"},
-        "name": {"type": "string", "minLength": 1, "maxLength": 100, "pattern": "\\S"},
+        **{key: {"type": "string", "minLength": 1, "maxLength": n, "pattern": "\\S"} for key, n in TEXTS.items()},
         "geometry": _plugin_schema("geometry", [geometry]),
         "finger": {"$ref": "#/$defs/finger"},
         "fingers": {

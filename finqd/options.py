@@ -95,7 +95,7 @@ def refuse_unknown(
         if key not in known:
             near = nearest(str(key), known)
             hint = f"did you mean {near}?" if near else f"known: {', '.join(known) or 'none'}"
-            raise error_type(f"unknown key; {hint}", join(where, key))
+            raise error_type(f"unknown key; {hint}", join(where, str(key)))
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
