@@ -1,0 +1,28 @@
+"""What every result of a grasp says of itself: which effects were on, and what was assumed."""
+
+#: effect -> on or off, and why
+EFFECTS = {
+    "object_contact": "on: always",
+    "friction": "on: always",
+    "floor": "on: always",
+    "actuator_force_limit": "on: where the actuation has a limit",
+    "gravity_on_fingers": "on: always",
+    "inertia": "on: always",
+    "large_rotation": "on: corotated elements",
+    "material_nonlinearity": "off: the corotated law is linear in the strain",
+    "damping": "off: only what implicit Euler itself dissipates",
+    "self_contact": "off: not built yet, walls and ribs of one finger pass through each other",
+    "finger_to_finger_contact": "off: not built yet, fingers pass through each other",
+    "soft_object": "off: objects are rigid",
+}
+
+#: finqd's own choices where the paper gives none
+ASSUMPTIONS = (
+    "object sizes, density, friction, time step, stroke, lift and hold time are finqd's choices: the paper gives none",
+    "finger profile: isosceles triangle, walls measured perpendicular, base plate 2 mm, ribs clipped by the cavity",
+    "the mount's volume is a 2.75 mm plate over the workspace triangle, chosen so that the paper's benchmark volume results",
+    "the mount is rigid: each finger base is driven as a whole",
+    "each finger's drive stalls by itself when the sum of the normal contact forces on that finger reaches its limit",
+    "the object starts at rest on the floor, centred under the gripper",
+    "held: dropped less than the threshold relative to the gripper from the start of the lift to the end of the hold",
+)

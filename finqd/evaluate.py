@@ -1,0 +1,216 @@
+"""Design -> Evaluation: the whole pipeline on one screen."""
+
+from __future__ import annotations
+
+import math
+import os
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from finqd.assumptions import ASSUMPTIONS, EFFECTS
+from finqd.contracts import FitnessResult
+from finqd.errors import InputError, MeshError
+from finqd.grasp import GraspTask, base_height, simulate_grasp
+from finqd.meshing import mesh_solid
+from finqd.objects import GraspObject, load_object, object_names
+from finqd.presets import apply_preset
+from finqd.trajectory import Trajectory
+from finqd.units import MM
+from finqd.workers import TaskFailure, run_tasks
+
+if TYPE_CHECKING:
+    from finqd.design import Design
+    from finqd.mesh import Mesh
+    from finqd.solid import Solid
+
+LIBRARIES = ("finqd", "numpy", "scipy", "numba", "gmsh", "qdldl", "pypardiso")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Everything that is known of one design.
+
+    status: "ok", or "mesh_failed" if there was nothing to simulate; reason: one sentence then
+    features: in the units that their names end in; trajectories: object name -> Trajectory
+    timings: wall-clock seconds; the only part, with each object's ``seconds``, that differs between equal runs
+    """
+
+    design: Design
+    preset: str
+    status: str
+    reason: str
+    result: FitnessResult
+    features: Mapping[str, float]
+    trajectories: Mapping[str, Trajectory]
+    mesh: Mapping[str, Any]
+    timings: Mapping[str, float] = field(compare=False)
+
+    @property
+    def fitness(self) -> float:
+        """Share of objects held."""
+        return self.result.fitness
+
+    @property
+    def margin(self) -> float:
+        """Mean margin over the objects; breaks ties of `fitness`."""
+        return self.result.margin
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as JSON holds it."""
+        return {
+            "format": "finqd result", "design": self.design.resolved(), "digest": self.design.digest(),
+            "preset": self.preset, "status": self.status, "reason": self.reason, "fitness": self.fitness,
+            "margin": self.margin, "features": dict(self.features),
+            "objects": {name: self._row(name, trajectory) for name, trajectory in self.trajectories.items()},
+            "mesh": dict(self.mesh), "timings": dict(self.timings), "effects": EFFECTS,
+            "assumptions": [*ASSUMPTIONS, *self.design.warnings], "versions": versions(),
+        }
+
+    def _row(self, name: str, trajectory: Trajectory) -> dict[str, Any]:
+        verdict = self.result.verdicts[name]
+        forces, penetrations = trajectory.contact_forces, trajectory.penetrations
+        simulated = bool(len(trajectory.times))
+        return {
+            "status": trajectory.status, "reason": trajectory.reason, "held": verdict.held,
+            "drop_mm": _finite(verdict.drop / MM), "margin": verdict.margin,
+            "max_contact_force_N": _finite(np.max(forces, initial=0.0)) if simulated else None,
+            "final_contact_force_N": [float(f) for f in forces[-1]] if simulated else None,
+            "max_penetration_mm": _finite(np.max(penetrations, initial=0.0) / MM) if simulated else None,
+            "final_height_mm": _finite(trajectory.rigid_positions[-1, 0, 2] / MM) if simulated else None,
+            "simulated_s": float(trajectory.times[-1]) if simulated else 0.0,
+            "steps": trajectory.counters.get("steps", 0),
+            "newton_iterations": trajectory.counters.get("newton_iterations", 0),
+            "counters": dict(trajectory.counters), "seconds": sum(trajectory.timings.values()),
+        }
+
+
+def evaluate(
+    design: Design, *, objects: Sequence[str | Path | GraspObject] | None = None, preset: str = "standard",
+    overrides: Mapping[str, Any] | None = None, jobs: int = 1, record: Path | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Evaluation:
+    """Build ``design``, mesh it, close it on every object (default: the ten that come with finqd), and score it.
+
+    overrides: design values by JSON path, stronger than ``preset``; jobs: grasps side by side; record: folder for
+    ParaView files; progress: called with object name and share done. Raises InputError for bad input; whatever
+    fails in mesh or simulation is in the result.
+    """
+    begun = clock.perf_counter()
+    chosen = apply_preset(design.with_overrides(overrides) if overrides else design, preset)
+    grasped = load_objects(objects)
+    solids = [chosen.plugin("geometry").build(chosen.finger_si(i)) for i in range(len(chosen.fingers))]
+    features: dict[str, float] = {}
+    for plugin in chosen.plugin("features"):
+        features.update(plugin.measure(chosen, solids))
+    timings = {"geometry": clock.perf_counter() - begun}
+    status, reason, mesh = "ok", "", {}
+    meshed = clock.perf_counter()
+    try:
+        meshes = finger_meshes(chosen, solids)
+        mesh = describe_meshes(meshes, chosen)
+    except MeshError as error:
+        status, reason = "mesh_failed", str(error)
+    timings["mesh"] = clock.perf_counter() - meshed
+    simulated = clock.perf_counter()
+    if status == "ok":
+        trajectories = _simulated(chosen, meshes, grasped, jobs=jobs, record=record, progress=progress)
+    else:
+        trajectories = {g.name: Trajectory(status=status, reason=reason, protocol=chosen.protocol) for g in grasped}
+    timings["simulation"] = clock.perf_counter() - simulated
+    timings["total"] = clock.perf_counter() - begun
+    return Evaluation(
+        design=chosen, preset=preset, status=status, reason=reason, result=chosen.plugin("fitness").score(trajectories),
+        features=features, trajectories=trajectories, mesh=mesh, timings=timings,
+    )
+
+
+def load_objects(objects: Sequence[str | Path | GraspObject] | None) -> list[GraspObject]:
+    """Return the objects of a grasp test, by default all that come with finqd. Raises InputError if names repeat."""
+    wanted = object_names() if objects is None else objects
+    grasped = [o if isinstance(o, GraspObject) else load_object(o) for o in wanted]
+    names = [g.name for g in grasped]
+    repeated = {name for name in names if names.count(name) > 1}
+    if repeated or not names:
+        raise InputError(f"each object once, please: {', '.join(sorted(repeated))}" if repeated else "no object", "objects")
+    return grasped
+
+
+def finger_meshes(design: Design, solids: Sequence[Solid]) -> tuple[Mesh, ...]:
+    """Return the mesh of each finger; equal fingers share one. Raises MeshError."""
+    mesher = design.plugin("mesher")
+    made: dict[str, Mesh] = {}
+    for i, solid in enumerate(solids):
+        key = repr(sorted(design.fingers[i].items()))
+        if key not in made:
+            made[key] = mesh_solid(mesher, solid)
+    return tuple(made[repr(sorted(finger.items()))] for finger in design.fingers)
+
+
+def describe_meshes(meshes: Sequence[Mesh], design: Design) -> dict[str, Any]:
+    """Return what a result says of its meshes."""
+    return {
+        "elements": {kind: sum(len(m.blocks.get(kind, ())) for m in meshes) for kind in sorted({k for m in meshes for k in m.blocks})},
+        "vertices": sum(m.n_vertices for m in meshes), "dofs": 3 * sum(m.n_vertices for m in meshes),
+        "volume_mm3": sum(m.volume for m in meshes) / MM**3, "base_height_mm": base_height(meshes, design.protocol) / MM,
+    }
+
+
+def _simulated(
+    design: Design, meshes: tuple[Mesh, ...], grasped: Sequence[GraspObject], *, jobs: int, record: Path | None,
+    progress: Callable[[str, float], None] | None,
+) -> dict[str, Trajectory]:
+    tasks = [GraspTask(design=design, meshes=meshes, grasped=g, record=record is not None) for g in grasped]
+
+    def on_progress(index: int, share: float) -> None:
+        if progress is not None:
+            progress(grasped[index].name, share)
+
+    def on_result(index: int, result: Any) -> None:
+        if record is not None and isinstance(result, Trajectory) and len(result.times):
+            _write_record(Path(record), tasks[index], result)
+        on_progress(index, 1.0)
+
+    results = run_tasks(simulate_grasp, tasks, jobs=jobs, on_progress=on_progress, on_result=on_result)
+    return {g.name: _as_trajectory(r, design, g.name) for g, r in zip(grasped, results, strict=True)}
+
+
+def _as_trajectory(result: Any, design: Design, name: str) -> Trajectory:
+    if isinstance(result, TaskFailure):
+        if isinstance(result.exception, InputError):
+            raise result.exception
+        return Trajectory(status=result.kind, reason=result.reason, object_name=name, protocol=design.protocol)
+    return result
+
+
+def _write_record(folder: Path, task: GraspTask, trajectory: Trajectory) -> None:
+    from finqd.grasp import grasp_scene
+    from finqd.record import write_paraview
+
+    scene, _ = grasp_scene(task)
+    target = folder / task.grasped.name
+    os.makedirs(target, exist_ok=True)
+    trajectory.save(target / "trajectory.npz")
+    write_paraview(
+        target, trajectory, [body.mesh for body in scene.soft_bodies], [(task.grasped.vertices, task.grasped.triangles)]
+    )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of finqd and of the libraries that can change a result."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
