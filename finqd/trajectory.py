@@ -18,11 +18,11 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -36,6 +36,18 @@ VERSION = 1
 _DAMAGE = (
     OSError, EOFError, ValueError, KeyError, AttributeError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
+
+
+class Surface(Protocol):
+    """A rigid body's surface in its body frame, as `finqd.objects.GraspObject` has it."""
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """Vertices [m], (n, 3)."""
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """Vertex ids, outward, (m, 3)."""
 
 
 def _empty(*shape: int) -> Any:
@@ -81,6 +93,22 @@ class Trajectory:
     def n_frames(self) -> int:
         """Number of frames."""
         return len(self.times)
+
+    def frame_at(self, time: float) -> int:
+        """Return the index of the frame nearest to ``time`` [s]."""
+        return int(np.argmin(np.abs(self.times - time)))
+
+    def recorded_at(self, time: float) -> int:
+        """Return the index into ``soft_positions`` nearest to ``time`` [s]. Raises InputError without recording."""
+        if not len(self.recorded_times):
+            raise InputError("the trajectory holds no recorded positions; simulate with record=True")
+        return int(np.argmin(np.abs(self.recorded_times - time)))
+
+    def placed(self, surfaces: Sequence[Surface], time: float) -> list[np.ndarray]:
+        """Return the vertices [m] of the rigid bodies' ``surfaces`` (body frame) at the frame nearest to ``time``."""
+        frame = self.frame_at(time)
+        poses = zip(self.rigid_positions[frame], self.rigid_rotations[frame])
+        return [surface.vertices @ rotation.T + position for surface, (position, rotation) in zip(surfaces, poses)]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to ``path``, whole or not at all."""
