@@ -144,7 +144,19 @@ def _motions(name: str, count: int) -> list[Any]:
 
 def _grasp(*, drop: float, status: str = "ok") -> Trajectory:
     """Return the record of a grasp in which the object ends ``drop`` [m] lower, relative to the gripper, than held."""
-    raise NotImplementedError(drop, status)
+    from finqd.protocol import GraspProtocol
+    from finqd.trajectory import Trajectory
+
+    protocol = GraspProtocol()
+    times = np.linspace(0.0, protocol.close_s + protocol.lift_s + protocol.hold_s, 101)
+    share = times / times[-1]
+    heights = 0.02 + (protocol.si("lift_mm") - np.nan_to_num(drop)) * share
+    return Trajectory(
+        status=status, reason="" if status == "ok" else "made up", object_name="object", object_drop=drop, times=times,
+        rigid_positions=np.stack([0.0 * times, 0.0 * times, heights], axis=1)[:, None],
+        rigid_rotations=np.tile(np.eye(3), (len(times), 1, 1, 1)), contact_forces=np.tile(share[:, None], (1, FINGERS)),
+        penetrations=0.0 * times, stroke=np.tile(share[:, None], (1, FINGERS)), protocol=protocol,
+    )
 
 
 def _bundled_designs() -> list[Design]:

@@ -76,7 +76,7 @@ _set_option = click.option(
 @_objects_option
 @click.option("--object", "surfaces", multiple=True, metavar="FILE",
               help="A watertight surface of your own (STL, OBJ or PLY, in mm); may be repeated.")
-@click.option("--mass-g", type=float, metavar="GRAMS", help="Mass of each --object.")
+@click.option("--mass-g", type=float, metavar="GRAMS", help="Mass of each --object, instead of a solid one's.")
 @click.option("--out", type=click.Path(path_type=Path), help="Write the whole result to this JSON file.")
 @_jobs_option
 @_preset_option
@@ -121,14 +121,17 @@ def optimise(
     design: str | None,
 ) -> None:
     """Search the design space for a map of different good grippers."""
-    from finqd.cli_files import usable_folder
+    from finqd.cli_progress import shown_progress
+    from finqd.cli_tables import print_search
     from finqd.search import optimise as run
 
     base = None if design is None else _read_design(design)
-    run(
-        iterations=iterations, batch=batch, objects=_split(object_names) or None, jobs=jobs, seed=seed,
-        out=usable_folder(out, "--out"), preset=preset, base_design=base,
-    )
+    with shown_progress() as progress:
+        result = run(
+            iterations=iterations, batch=batch, objects=_split(object_names) or None, jobs=jobs, seed=seed, out=out,
+            preset=preset, base_design=base, progress=progress,
+        )
+    print_search(result)
 
 
 @finqd.command()
@@ -140,7 +143,8 @@ def export(design: str, out: Path, settings: tuple[str, ...]) -> None:
     """Write the gripper's shape, with its mount, for printing (STL) or CAD (STEP)."""
     from finqd.export import export_gripper
 
-    export_gripper(_read_design(design, settings), out)
+    for path in export_gripper(_read_design(design, settings), out):
+        click.echo(path)
 
 
 @finqd.command()
@@ -222,13 +226,11 @@ def _split(values: Sequence[str]) -> list[str]:
 def _read_surfaces(surfaces: Sequence[str], mass_g: float | None) -> list[Any]:
     if mass_g is not None and not surfaces:
         raise InputError("goes with --object", "--mass-g")
-    if surfaces and (mass_g is None or not 0 < mass_g < 1e6):
-        raise InputError("--mass-g must say its mass, above 0 and below 1000000 g", "--object")
     if not surfaces:
         return []
-    from finqd.objects import load_surface
+    from finqd.objects import load_object
 
-    return [load_surface(Path(surface), mass_g=mass_g) for surface in surfaces]
+    return [load_object(Path(surface), mass_g=mass_g) for surface in surfaces]
 
 
 def _refuse(sentence: str) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
@@ -12,6 +12,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from finqd.doctor import Finding
     from finqd.registry import Option
+    from finqd.search import SearchResult
 
 #: a table is never squeezed below this: when stdout is a file there is no terminal whose width would matter
 MINIMUM_WIDTH = 110
@@ -45,6 +46,21 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
         _print_part(console, part, result.get(part))
 
 
+def print_search(result: SearchResult) -> None:
+    """Print the elites of a search, best first, and where the rest is."""
+    console = _console()
+    axes = list(result.ranges)
+    table = _table("cell", "fitness>", "margin>", *(f"{axis}>" for axis in axes))
+    elites = sorted(result.elites, key=lambda elite: (-elite[1]["fitness"], -elite[1]["margin"]))
+    for cell, record in elites:
+        features = [_number(record["features"][axis], 1) for axis in axes]
+        table.add_row(str(cell), _number(record["fitness"], 3), _number(record["margin"], 3), *features)
+    console.print(table)
+    failed = sum(record.get("status") != "ok" for record in result.records)
+    counts = f"{len(result.records)} designs evaluated, {failed} failed, {len(elites)} elites"
+    console.print(f"{counts}; everything is in {escape(str(result.out))}", soft_wrap=True)
+
+
 def print_plugins(kind: str | None) -> None:
     """Print every registered plugin: who brought it, its one line, its options. One that does not load says why."""
     from finqd import registry
@@ -66,7 +82,7 @@ def print_plugins(kind: str | None) -> None:
 
 
 def print_objects() -> None:
-    """Print the objects that come with finqd: name, mass, size, description."""
+    """Print the objects that come with finqd: name, mass, size."""
     from finqd.data import bundled_names, objects_folder
     from finqd.objects import load_object
 
@@ -83,15 +99,14 @@ def print_designs() -> None:
     from finqd.data import bundled_names, designs_folder
     from finqd.json_input import read_json_object
 
-    table = _table("design", "file", "description")
-    for name in bundled_names(designs_folder()):
-        path = designs_folder() / f"{name}.json"
-        document, _ = read_json_object(path, kind="design")
-        table.add_row(escape(name), escape(str(path)), escape(str(document.get("description", ""))))
-    _console().print(table)
+    console, folder = _console(), designs_folder()
+    for name in bundled_names(folder):
+        document, _ = read_json_object(folder / f"{name}.json", kind="design")
+        console.print(f"[bold]{escape(name)}[/bold]: {escape(str(document.get('description', '')))}", soft_wrap=True)
+    console.print(f"in {escape(str(folder))}", soft_wrap=True)
 
 
-def print_findings(findings: Sequence[Finding]) -> None:
+def print_findings(findings: list[Finding]) -> None:
     """Print what `finqd.doctor.examine` found, and the verdict."""
     from finqd.doctor import fit
 
