@@ -87,8 +87,8 @@ def _rigid_mesh(trajectory: Trajectory, surfaces: Sequence[Surface], time: float
         return None
     vertices = trajectory.placed(surfaces, time)
     starts = np.cumsum([0, *(len(points) for points in vertices[:-1])])
-    cells = [("triangle", start + surface.triangles) for start, surface in zip(starts, surfaces)]
-    bodies = [np.full(len(surface.triangles), body) for body, surface in enumerate(surfaces)]
+    cells = [("triangle", start + triangles) for start, (_, triangles) in zip(starts, surfaces)]
+    bodies = [np.full(len(triangles), body) for body, (_, triangles) in enumerate(surfaces)]
     return meshio.Mesh(np.concatenate(vertices), cells, cell_data={"body": bodies})
 
 

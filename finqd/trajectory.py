@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -32,22 +32,13 @@ from finqd.protocol import GraspProtocol
 FORMAT = "finqd trajectory"
 VERSION = 1
 
+#: a rigid body's surface in its body frame: vertices [m], (n, 3), and triangles (m, 3), outward
+Surface = tuple[np.ndarray, np.ndarray]
+
 #: what NumPy, zipfile and json raise for bytes that are not what they should be
 _DAMAGE = (
     OSError, EOFError, ValueError, KeyError, AttributeError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-
-
-class Surface(Protocol):
-    """A rigid body's surface in its body frame, as `finqd.objects.GraspObject` has it."""
-
-    @property
-    def vertices(self) -> np.ndarray:
-        """Vertices [m], (n, 3)."""
-
-    @property
-    def triangles(self) -> np.ndarray:
-        """Vertex ids, outward, (m, 3)."""
 
 
 def _empty(*shape: int) -> Any:
@@ -108,7 +99,7 @@ class Trajectory:
         """Return the vertices [m] of the rigid bodies' ``surfaces`` (body frame) at the frame nearest to ``time``."""
         frame = self.frame_at(time)
         poses = zip(self.rigid_positions[frame], self.rigid_rotations[frame])
-        return [surface.vertices @ rotation.T + position for surface, (position, rotation) in zip(surfaces, poses)]
+        return [vertices @ rotation.T + position for (vertices, _), (position, rotation) in zip(surfaces, poses)]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to ``path``, whole or not at all."""
@@ -159,7 +150,8 @@ class Trajectory:
             protocol = None if constants is None else GraspProtocol(**constants)
         except TypeError as error:
             raise InputError("damaged, or written by another version of finqd", where) from error
-        return cls(**header, **arrays, energies=energies, protocol=protocol)
+        values: dict[str, Any] = {**header, **arrays}
+        return cls(**values, energies=energies, protocol=protocol)
 
 
 @contextmanager

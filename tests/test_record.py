@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import meshio
@@ -17,9 +16,9 @@ from finqd.mesh_shapes import box_mesh
 from finqd.record import write_paraview
 from finqd.trajectory import Trajectory
 
-TETRAHEDRON = SimpleNamespace(
-    vertices=np.array([(0, 0, 0), (0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.01)], dtype=float),
-    triangles=np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)]),
+TETRAHEDRON = (
+    np.array([(0, 0, 0), (0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.01)], dtype=float),
+    np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)]),
 )
 KINDS = ("hex8", "wedge6", "tet4", "tet10", "hex20")
 
@@ -93,8 +92,8 @@ def test_rigid_surfaces_are_where_their_pose_says(tmp_path):
     write_paraview(tmp_path, trajectory, meshes, [TETRAHEDRON])
     back = meshio.read(tmp_path / "frames" / "rigid_00002.vtu")
     turn = np.array([[np.cos(0.2), -np.sin(0.2), 0], [np.sin(0.2), np.cos(0.2), 0], [0, 0, 1]])
-    np.testing.assert_allclose(back.points, TETRAHEDRON.vertices @ turn.T + (0, 0, -0.2), atol=1e-15)
-    np.testing.assert_array_equal(back.cells_dict["triangle"], TETRAHEDRON.triangles)
+    np.testing.assert_allclose(back.points, TETRAHEDRON[0] @ turn.T + (0, 0, -0.2), atol=1e-15)
+    np.testing.assert_array_equal(back.cells_dict["triangle"], TETRAHEDRON[1])
 
 
 def test_a_scene_of_rigid_bodies_alone_has_no_soft_files(tmp_path):
