@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from finqd.mechanics.distance import corner_angles, edge_table, triangle_neighbours, triangle_normals
+from finqd.mechanics.distance import corner_angles, triangle_normals
 
 SPACING = 1e-3  # between samples of a sharp edge [m]
 SHARP = np.deg2rad(20.0)  # a smaller angle between two faces' normals is a curved surface's facet, not an edge
 FEATURE_LIMIT = 20_000  # samples; a rough scan is sampled more coarsely
-SUPPORT_LIMIT = 200
+SUPPORT_LIMIT = 400  # points; on a ball of 20 mm in radius the floor then reaches up to 0.2 mm between them
 STABLE = np.deg2rad(1.0)  # tilt that a resting pose must survive
 
 
-def surface_features(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (points (n, 3), lengths (n,)) [m]: samples of sharp convex edges, then tips with length 0."""
-    ends = _sharp_edges(vertices, triangles)
-    tips = _sharp_vertices(vertices, triangles)
+def surface_features(
+    vertices: np.ndarray, triangles: np.ndarray, topology: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (points (n, 3), lengths (n,)) [m]: samples of sharp convex edges, then tips with length 0.
+
+    vertices: [m], shape (k, 3); triangles: shape (m, 3), watertight and outward; topology: of `triangle_neighbours`.
+    """
+    normals, _ = triangle_normals(vertices, triangles, topology[1])
+    ends = _sharp_edges(vertices, triangles, normals, topology)
+    tips = _sharp_vertices(vertices, triangles, normals)
     edge_lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     spacing = SPACING
     while True:
@@ -47,7 +53,7 @@ def revolution_features(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ring(r: float, z: float, n: int) -> np.ndarray:
-    """Return ``n`` points [m] around z at radius r and height z, shape (n, 3); +x lies between the last and the first."""
+    """Return ``n`` points [m] around z at radius r, height z, shape (n, 3); +x lies between the last and the first."""
     angles = 2.0 * np.pi * (np.arange(n) + 0.5) / n
     return np.column_stack([r * np.cos(angles), r * np.sin(angles), np.full(n, z)])
 
@@ -153,33 +159,38 @@ def _turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
 
 
-def _sharp_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _sharp_edges(
+    vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray, topology: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
     """Return end points [m] of the edges whose faces turn outwards by more than `SHARP`, shape (n, 2, 3)."""
-    edges, edge_of, _ = edge_table(triangles)
-    _, neighbours = triangle_neighbours(triangles)
-    normals, _ = triangle_normals(vertices, triangles, neighbours)
-    centres = vertices[triangles].mean(axis=1)
-    here, side = np.divmod(np.unique(edge_of.reshape(-1), return_index=True)[1], 3)
+    edge_of, neighbours = topology
+    position = np.empty(edge_of.max() + 1, dtype=np.int64)
+    position[edge_of.reshape(-1)] = np.arange(edge_of.size)
+    here, side = np.divmod(position, 3)
     there = neighbours[here, side]
-    sharp = np.einsum("ij,ij->i", normals[here], normals[there]) < np.cos(SHARP)
-    convex = np.einsum("ij,ij->i", normals[there] - normals[here], centres[there] - centres[here]) > 0.0
-    return vertices[edges[sharp & convex]]
+    sharp = np.flatnonzero(np.einsum("ij,ij->i", normals[here], normals[there]) < np.cos(SHARP))
+    here, side, there = here[sharp], side[sharp], there[sharp]
+    towards = vertices[triangles[there]].mean(axis=1) - vertices[triangles[here]].mean(axis=1)
+    convex = np.einsum("ij,ij->i", normals[there] - normals[here], towards) > 0.0
+    edges = np.stack([triangles[here, side], triangles[here, (side + 1) % 3]], axis=1)
+    return vertices[edges[convex]]
 
 
-def _sharp_vertices(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _sharp_vertices(vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return the vertices that are tips: their faces leave more than `SHARP` of the full angle open, all edges drop."""
     angles = corner_angles(vertices, triangles)
     around = np.bincount(triangles.reshape(-1), weights=angles.reshape(-1), minlength=len(vertices))
-    _, neighbours = triangle_neighbours(triangles)
-    normals, _ = triangle_normals(vertices, triangles, neighbours)
+    tip = (around > 0.0) & (2.0 * np.pi - around > SHARP)
     outward = np.zeros((len(vertices), 3))
     for corner in range(3):
-        np.add.at(outward, triangles[:, corner], angles[:, corner, None] * normals)
-    rises = np.zeros(len(vertices), dtype=bool)
+        rows = np.flatnonzero(tip[triangles[:, corner]])
+        np.add.at(outward, triangles[rows, corner], angles[rows, corner, None] * normals[rows])
     for start, end in ((0, 1), (1, 2), (2, 0)):  # each edge runs both ways in its two triangles
-        a, b = triangles[:, start], triangles[:, end]
-        rises[a[np.einsum("ij,ij->i", vertices[b] - vertices[a], outward[a]) > 0.0]] = True
-    return np.flatnonzero((around > 0.0) & (2.0 * np.pi - around > SHARP) & ~rises)
+        rows = np.flatnonzero(tip[triangles[:, start]])
+        a, b = triangles[rows, start], triangles[rows, end]
+        rises = np.einsum("ij,ij->i", vertices[b] - vertices[a], outward[a]) > 0.0
+        tip[a[rises]] = False
+    return np.flatnonzero(tip)
 
 
 def _sample_edges(ends: np.ndarray, lengths: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:

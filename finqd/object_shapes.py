@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from finqd.errors import InputError
-from finqd.mechanics.distance import revolution_field, sphere_field, surface_field
+from finqd.mechanics.distance import revolution_field, sphere_field, surface_field, triangle_neighbours
 from finqd.mechanics.distance_kernels import DistanceField
 from finqd.mechanics.mass_properties import ball_moments, revolution_moments, surface_moments
 from finqd.object_features import revolution_features, surface_features
@@ -94,14 +94,15 @@ def solid_of_revolution(profile: np.ndarray) -> Shape:
 def solid_in_surface(vertices: np.ndarray, triangles: np.ndarray) -> Shape:
     """Return the solid inside a watertight, outward surface: vertices [m], shape (n, 3), triangles (m, 3)."""
     moments = surface_moments(vertices, triangles)
+    topology = triangle_neighbours(triangles)
     vertices = vertices - moments.centre
     return Shape(
         moments.volume,
         moments.inertia,
         vertices,
         triangles,
-        surface_field(vertices, triangles),
-        *surface_features(vertices, triangles),
+        surface_field(vertices, triangles, topology=topology),
+        *surface_features(vertices, triangles, topology),
     )
 
 

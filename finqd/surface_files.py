@@ -44,8 +44,9 @@ def checked_surface(vertices: np.ndarray, triangles: np.ndarray, where: str) -> 
     """
     _refuse_open(triangles, where)
     triangles = _consistently_wound(vertices, triangles, where)
-    shells = _shells(triangles)
-    _refuse_pinched(triangles, where)
+    _, neighbours = triangle_neighbours(triangles)
+    _refuse_pinched(triangles, neighbours, where)
+    shells = _components(len(triangles), np.repeat(np.arange(len(triangles)), 3), neighbours.reshape(-1))
     volumes = np.array([surface_moments(vertices, triangles[shells == i]).volume for i in range(shells.max() + 1)])
     size = np.ptp(vertices, axis=0).max()
     outer = int(np.argmax(np.abs(volumes)))
@@ -83,6 +84,8 @@ def _load(path: Path) -> Any:
             return trimesh.load(stream, file_type=kind, force="mesh", process=False, skip_materials=True)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", str(path)) from error
+    except ImportError as error:  # trimesh guesses encodings of what looks like no such file with a further library
+        raise InputError(f"cannot be read as {kind.upper()}: cut short, or another format", str(path)) from error
     except Exception as error:  # a parser of foreign files may raise anything
         reason = " ".join(str(error).split())[:100] or type(error).__name__
         raise InputError(f"cannot be read as {kind.upper()}: {reason}", str(path)) from error
@@ -104,8 +107,8 @@ def _merged(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
     _, pair = np.unique(low * len(first) + middle, return_inverse=True)
     _, kept = np.unique(pair * len(first) + high, return_index=True)
     triangles = triangles[np.sort(kept)]
-    used, renumbered = np.unique(triangles, return_inverse=True)
-    return vertices[first[used]], renumbered.reshape(-1, 3)
+    used = np.bincount(triangles.reshape(-1), minlength=len(first)) > 0
+    return vertices[first[used]], (np.cumsum(used) - 1)[triangles]
 
 
 def _refuse_open(triangles: np.ndarray, where: str) -> None:
@@ -135,31 +138,25 @@ def _consistently_wound(vertices: np.ndarray, triangles: np.ndarray, where: str)
 def _is_wound(triangles: np.ndarray) -> bool:
     """Return whether every edge is run through once in each direction."""
     start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
-    keys = start * (int(triangles.max()) + 1) + end
-    return len(np.unique(keys)) == len(keys)
+    keys = np.sort(start * (int(triangles.max()) + 1) + end)
+    return not np.any(keys[1:] == keys[:-1])
 
 
-def _shells(triangles: np.ndarray) -> np.ndarray:
-    """Return the number of the connected surface that each triangle belongs to, shape (m,)."""
-    _, neighbours = triangle_neighbours(triangles)
-    return _components(len(triangles), np.repeat(np.arange(len(triangles)), 3), neighbours.reshape(-1))
-
-
-def _refuse_pinched(triangles: np.ndarray, where: str) -> None:
+def _refuse_pinched(triangles: np.ndarray, neighbours: np.ndarray, where: str) -> None:
     """Raise ``InputError`` if two fans of triangles meet in one vertex: distance has no sign there."""
     m = len(triangles)
-    edge_of, neighbours = triangle_neighbours(triangles)
     corner = np.arange(3 * m)
     triangle, side = np.divmod(corner, 3)
     other = neighbours[triangle, side]  # across the side that starts at this corner
     matches = np.argmax(triangles[other] == triangles[triangle, side][:, None], axis=1)
     fans = _components(3 * m, corner, 3 * other + matches)
-    pinched = fans.max() + 1 - len(np.unique(triangles))
+    pinched = fans.max() + 1 - np.count_nonzero(np.bincount(triangles.reshape(-1)))
     if pinched:
         raise InputError(f"is not manifold: it touches itself in {pinched} vertices", where)
 
 
 def _components(n: int, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return which connected part each of ``n`` nodes is in, shape (n,), given links from ``start`` to ``end``."""
     graph = sp.coo_array((np.ones(len(start), dtype=np.int8), (start, end)), shape=(n, n))
     return sp.csgraph.connected_components(graph.tocsr(), directed=False)[1]
 

@@ -35,14 +35,17 @@ def revolution_field(profile: np.ndarray) -> DistanceField:
     return _field(kind=REVOLUTION, rows=rows[~on_axis])
 
 
-def surface_field(vertices: np.ndarray, triangles: np.ndarray) -> DistanceField:
+def surface_field(
+    vertices: np.ndarray, triangles: np.ndarray, *, topology: tuple[np.ndarray, np.ndarray] | None = None
+) -> DistanceField:
     """Return the field of a watertight, outward oriented triangle surface.
 
-    vertices: [m], shape (n, 3); triangles: shape (m, 3), every edge shared by exactly two of them (else ValueError).
+    vertices: [m], shape (n, 3); triangles: shape (m, 3), every edge shared by exactly two of them (else ValueError);
+    topology: what `triangle_neighbours` returns for them, if it is known.
     """
     vertices = np.asarray(vertices, dtype=float)
     triangles = np.asarray(triangles, dtype=np.int64)
-    edge_of, neighbours = triangle_neighbours(triangles)
+    edge_of, neighbours = topology or triangle_neighbours(triangles)
     normals, flat = triangle_normals(vertices, triangles, neighbours)
     edge_normals = _edge_normals(vertices, triangles, edge_of, neighbours, normals, flat)
     pseudonormals = _unit(np.concatenate([edge_normals, _vertex_normals(vertices, triangles, normals)]))
