@@ -2,8 +2,8 @@
 
     python benchmarks/compliance.py [--profile right|isosceles] [--case "hex8 4"] [--json FILE]
 
-Base clamped; 10 N in the linear range, spread over the contact face between 40 and 55 mm from the base (measured along the
-face), normal to it, into the finger. C is the displacement conjugate to that force, f . u / 10 N.
+Base clamped; 10 N in the linear range, spread over the contact face between 40 and 55 mm from the base (measured along
+the face), normal to it, into the finger. C is the displacement conjugate to that force, f . u / 10 N.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Kernels of the corotated potential: energy, exact gradient and exact Hessian, one rotation an element.
 
-E = 1/2 u^T K u with u_a = R^T (x_a - c) - (X_a - C), R the rotation closest to F = sum_a x_a (x) g_a, K the stiffness at
-rest [N/m] and g_a the mean gradients of the shape functions [1/m]. In the element's frame (b_a = R^T dx_a):
+E = 1/2 u^T K u with u_a = R^T (x_a - c) - (X_a - C), R the rotation closest to F = sum_a x_a (x) g_a, K the stiffness
+at rest [N/m] and g_a the mean gradients of the shape functions [1/m]. In the element's frame (b_a = R^T dx_a):
 
     y_a = R^T (x_a - c)    f = K u    S = R^T F    G = tr(S) 1 - S    t = sum_a y_a x f_a    h = G^-1 t
     d omega = G^-1 sum_a g_a x b_a = Omega b      dR = R [d omega]_x      du = b + Y Omega b,  Y_a = [y_a]_x
@@ -26,6 +26,7 @@ from numba import njit
 from finqd.mechanics.polar_kernels import closest_rotation, symmetric_eigen
 
 SINGULAR = 1e-6  # smallest s_i + s_j [-] of an element's stretch at which its rotation still has a derivative
+COUPLING = 0.5  # largest W2 - W3 over W2 that a projected Hessian keeps [-] (`_clamp_spin`)
 
 
 @njit(cache=True)
@@ -258,12 +259,13 @@ def _products(a, b, out):
 
 @njit(cache=True)
 def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, small):
-    """Add to W (3, 3) [J] the smallest change that makes the element's Hessian positive semidefinite.
+    """Change W (3, 3) [J] (and Q, rarely) so that the element's Hessian becomes positive semidefinite.
 
-    With b = du - Y omega the Hessian's form is du^T K du + 2 du^T Q omega + omega^T W2 omega, W2 = W - Y^T Q - Q^T Y, for
-    du without spin (Omega du = 0). K is positive there, so the form is semidefinite exactly if the Schur complement
-    W3 = W2 - Q~^T K^+ Q~ is; Q~ = Q - Omega^T lambda is Q without its moment about the rest shape. Negative eigenvalues of W3
-    become zero.
+    With b = du - Y omega the Hessian's form is du^T K du + 2 du^T Q omega + omega^T W2 omega,
+    W2 = W - Y^T Q - Q^T Y, for du without spin (Omega du = 0). K is positive there, so the form is semidefinite exactly
+    if the Schur complement W3 = W2 - Q~^T K^+ Q~ is (Q~ = Q - Omega^T lambda: Q without its moment about the rest shape).
+    Negative eigenvalues of W3 become zero. Where W3 is far below W2 (Q bends an element's soft modes) that would
+    stiffen it too much, and Q is scaled down first: the Hessian then stays within the order of the stress.
 
     compliance: K^+ [m/N], (n, 3k, 3k); q_columns: rows are the columns of Q, (3, 3k)
     rigid, kq: scratch (3, 3k); small: scratch (2, 3, 3)
@@ -295,10 +297,11 @@ def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, smal
         for j in range(3):
             w[i, j] -= v[i, j]
             size += w[i, j] * w[i, j]
+    limit = max(w[0, 0] + w[1, 1] + w[2, 2], COUPLING * math.sqrt(size))
     trace = w3[0, 0] + w3[1, 1] + w3[2, 2]
     share = 1.0  # of the coupling Q that is kept
-    if trace * trace > 3.0 * size:
-        share = math.sqrt(math.sqrt(3.0 * size) / trace)
+    if trace > limit:  # never so where the element is semidefinite already
+        share = math.sqrt(limit / trace)
         for i in range(3):
             for n in range(3 * k):
                 q_columns[i, n] *= share

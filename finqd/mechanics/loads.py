@@ -26,8 +26,8 @@ def face_tractions(
 
     face_set: name of a face set of the mesh, or face type -> indices into ``mesh.faces[face type]``
     traction: vector [Pa], or function of points (m, 3) [m] and outward unit normals (m, 3) -> (m, 3) [Pa]
-    region: function of points (m, 3) -> bool (m,): only that part of the faces is loaded. Its edge may cut through faces: each
-    face is integrated in ``subdivisions`` squared cells, which bounds the error.
+    region: function of points (m, 3) -> bool (m,): only that part of the faces is loaded. Its edge may cut through
+    faces: each face is integrated in ``subdivisions`` squared cells, which bounds the error.
     Raises InputError for an unknown face set.
     """
     forces = np.zeros((len(mesh.vertices), 3))

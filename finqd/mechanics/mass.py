@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 def lumped_masses(mesh: Mesh, density: float) -> np.ndarray:
     """Return the mass of every vertex [kg], shape (n_vertices,), positive where an element has the vertex.
 
-    Their sum is ``density`` [kg/m^3] times the mesh's volume. Linear elements: row sums, m_a = rho int N_a dV, which keep the
-    centre of mass too. Quadratic ones, whose row sums are negative at corners: m_a proportional to the diagonal int N_a^2 dV
-    (Hinton, Rock and Zienkiewicz, Earthquake Eng. Struct. Dyn. 4 (1976) 245). Raises InputError for unknown types.
+    Their sum is ``density`` [kg/m^3] times the mesh's volume. Linear elements: row sums, m_a = rho int N_a dV, which
+    keep the centre of mass too. Quadratic ones, whose row sums are negative at corners: m_a in proportion to the
+    diagonal int N_a^2 dV (Hinton, Rock and Zienkiewicz, Earthquake Eng. Struct. Dyn. 4 (1976) 245). Raises InputError
+    for unknown types.
     """
     masses = np.zeros(len(mesh.vertices))
     for name, nodes in mesh.blocks.items():

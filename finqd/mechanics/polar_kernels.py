@@ -88,15 +88,15 @@ def closest_rotation(f, r):
     """Write to r the proper rotation closest to F: argmax tr(R^T F) over det R = 1, for any F (det F <= 0 too).
 
     f: matrix [-], shape (3, 3); r: shape (3, 3), overwritten
-    Scaled Newton iteration X <- (g X + X^-T / g) / 2 for det F well above 0 (Higham, SIAM J. Sci. Stat. Comput. 7
-    (1986) 1160; Frobenius scaling g), Horn's quaternion otherwise. A pure function of F: no warm start.
+    Scaled Newton iteration X <- (g X + X^-T / g) / 2 where det F is well above 0 and far from overflow (Higham, SIAM J.
+    Sci. Stat. Comput. 7 (1986) 1160; Frobenius scaling g), Horn's quaternion otherwise. No warm start: a pure function.
     """
     a, b, c = f[0, 0], f[0, 1], f[0, 2]
     d, e, g = f[1, 0], f[1, 1], f[1, 2]
     h, k, m = f[2, 0], f[2, 1], f[2, 2]
     size = a * a + b * b + c * c + d * d + e * e + g * g + h * h + k * k + m * m
     det = a * (e * m - g * k) + b * (g * h - d * m) + c * (d * k - e * h)
-    if not det > 1e-4 * size * math.sqrt(size):
+    if not 1e-4 * size * math.sqrt(size) < det < 1e90:
         _rotation_by_quaternion(f, r)
         return
     scaled = True

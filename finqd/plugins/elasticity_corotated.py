@@ -86,8 +86,8 @@ class CorotatedPotential:
     ) -> None:
         """Add the Hessian [N/m] to ``blocks`` (n_blocks, 3, 3).
 
-        ``projected``: exact where an element's Hessian is positive semidefinite, else with the smallest stiffness against its
-        spin that makes it so.
+        ``projected``: exact where an element's Hessian is positive semidefinite, else changed by what makes it so,
+        which is of the order of the stress (``_clamp_spin`` in the kernels).
         """
         for b, slot in zip(self.blocks, slots, strict=True):
             compliance = b.compliance if projected else _NONE
