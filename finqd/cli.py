@@ -148,11 +148,12 @@ def export(design: str, out: Path, settings: tuple[str, ...]) -> None:
 
 
 @finqd.command()
-def schema() -> None:
+@click.option("--geometry", default="fin_ray", show_default=True, metavar="NAME", help="Finger type of the designs.")
+def schema(geometry: str) -> None:
     """Print the JSON Schema of design files."""
     from finqd.design import Design
 
-    click.echo(json.dumps(Design.json_schema(), indent=2))
+    click.echo(json.dumps(Design.json_schema(geometry), indent=2))
 
 
 @finqd.command()

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
-from collections.abc import Callable, Mapping
+import sysconfig
+import venv
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -17,7 +21,7 @@ MakeDistribution = Callable[..., None]
 
 
 @pytest.fixture
-def make_distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MakeDistribution:
+def make_distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[MakeDistribution]:
     """Return a function that puts a fake installed distribution on ``sys.path``, and takes it off after the test."""
     modules: list[str] = []
 
@@ -40,3 +44,69 @@ def make_distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MakeDi
     yield make
     for module in modules:
         sys.modules.pop(module, None)
+
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A virtual environment with wheels of its own; libraries come from the environment that runs the tests."""
+
+    folder: Path
+
+    @property
+    def site_packages(self) -> Path:
+        paths = {"base": str(self.folder), "platbase": str(self.folder)}
+        return Path(sysconfig.get_path("purelib", "venv", paths))
+
+    def executable(self, name: str) -> str:
+        return str(Path(sysconfig.get_path("scripts", "venv", {"base": str(self.folder)})) / name)
+
+    def finqd(self, *arguments: str, cwd: Path, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """Run a command of finqd in this environment."""
+        return self.run("python", "-m", "finqd", *arguments, cwd=cwd, check=check)
+
+    def run(self, name: str, *arguments: str, cwd: Path, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """Run a program of this environment, away from the checkout."""
+        environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+        done = subprocess.run(
+            [self.executable(name), *arguments], cwd=cwd, env=environment, capture_output=True, text=True,
+            stdin=subprocess.DEVNULL,
+        )
+        assert not check or done.returncode == 0, f"{name} {arguments}: {done.stdout}\n{done.stderr}"
+        return done
+
+
+def make_environment(folder: Path, sources: Sequence[Path], *, shared: Sequence[Path] = ()) -> Environment:
+    """Build a wheel of each source folder and install it in a new environment, without asking any index.
+
+    shared: further folders on its path. The libraries of the running environment come last; an editable finqd there
+    does not come along, because only the environment's own ``.pth`` files count.
+    """
+    venv.create(folder, with_pip=False)
+    environment = Environment(folder)
+    wheels = folder / "wheels"
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    build = [*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", wheels]
+    subprocess.run([*build, *sources], check=True)
+    install = [*pip, "--python", environment.executable("python"), "install", "--no-deps", "--no-index"]
+    subprocess.run([*install, *wheels.glob("*.whl")], check=True)
+    libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    (environment.site_packages / "shared.pth").write_text("\n".join([*map(str, shared), *sorted(libraries)]) + "\n")
+    return environment
+
+
+@pytest.fixture(scope="session")
+def wheel_environment(tmp_path_factory: pytest.TempPathFactory) -> Environment:
+    """An environment in which finqd is installed from its wheel, as a user has it."""
+    return make_environment(tmp_path_factory.mktemp("wheel") / "env", [ROOT])
+
+
+@pytest.fixture(scope="session")
+def example_environment(tmp_path_factory: pytest.TempPathFactory, wheel_environment: Environment) -> Environment:
+    """An environment with the example distribution beside that very finqd, so that kernels compile only once."""
+    source = ROOT / "examples" / "finqd-tapered-finger"
+    return make_environment(
+        tmp_path_factory.mktemp("example") / "env", [source], shared=[wheel_environment.site_packages]
+    )
