@@ -26,9 +26,12 @@ _OPTIONS = {
 def gmsh_session() -> Iterator[Any]:
     """Yield the module ``gmsh`` with an empty model, whose options and entities are gone afterwards.
 
-    The user's own gmsh settings are not read, and Ctrl-C stays Python's. Raises ``MissingLibraryError``.
+    The user's own gmsh settings are not read, and Ctrl-C stays Python's. Raises ``MissingLibraryError``, and
+    ``RuntimeError`` inside another session: gmsh has one state per process.
     """
     gmsh = require_gmsh()
+    if gmsh.isInitialized():
+        raise RuntimeError("gmsh is in use in this process already")
     gmsh.initialize(["finqd"], readConfigFiles=False, interruptible=False)
     try:
         for name, value in _OPTIONS.items():
