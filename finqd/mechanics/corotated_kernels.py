@@ -263,7 +263,7 @@ def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, smal
 
     With b = du - Y omega the Hessian's form is du^T K du + 2 du^T Q omega + omega^T W2 omega,
     W2 = W - Y^T Q - Q^T Y, for du without spin (Omega du = 0). K is positive there, so the form is semidefinite exactly
-    if the Schur complement W3 = W2 - Q~^T K^+ Q~ is (Q~ = Q - Omega^T lambda: Q without its moment about the rest shape).
+    if the Schur complement W3 = W2 - Q~^T K^+ Q~ is (Q~ = Q - Omega^T lambda: Q without its moment about the rest).
     Negative eigenvalues of W3 become zero. Where W3 is far below W2 (Q bends an element's soft modes) that would
     stiffen it too much, and Q is scaled down first: the Hessian then stays within the order of the stress.
 

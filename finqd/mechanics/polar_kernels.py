@@ -35,7 +35,8 @@ def symmetric_eigen(a, v):
 @njit(cache=True)
 def _jacobi_rotation(a, v, p, q):
     """Annihilate a[p, q] by a plane rotation of rows and columns p and q; accumulate it in v."""
-    if a[p, q] == 0.0:
+    if abs(a[p, q]) <= 1e-18 * (abs(a[p, p]) + abs(a[q, q])):  # below rounding; its square might overflow below
+        a[p, q] = a[q, p] = 0.0
         return
     theta = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
     t = 1.0 / (abs(theta) + math.sqrt(1.0 + theta * theta))
