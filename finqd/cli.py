@@ -92,15 +92,14 @@ def evaluate(
     from finqd.cli_files import usable_folder, written_at_end
     from finqd.cli_progress import shown_progress
     from finqd.cli_tables import print_evaluation
-    from finqd.evaluate import evaluate as run
 
     chosen = _read_design(design, settings)
     objects = [*_split(object_names), *_read_surfaces(surfaces, mass_g)] or None
     with written_at_end(out, "--out") as write, shown_progress(quiet=quiet) as progress:
-        result = run(
-            chosen, objects=objects, preset=preset, jobs=jobs, record=usable_folder(record, "--record"),
-            progress=progress,
-        )
+        folder = usable_folder(record, "--record")
+        from finqd.evaluate import evaluate as run  # takes a second, so only when nothing is left to refuse
+
+        result = run(chosen, objects=objects, preset=preset, jobs=jobs, record=folder, progress=progress)
         write(json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     if not quiet:
         print_evaluation(result.to_dict())
