@@ -68,12 +68,12 @@ def shape_from_json(value: Any, where: str, folder: Path) -> Shape:
 
 def ball(radius: float) -> Shape:
     """Return a ball of ``radius`` [m]."""
-    angles = np.linspace(-np.pi / 2.0, np.pi / 2.0, 33)
+    angles = np.linspace(-np.pi / 2.0, np.pi / 2.0, AROUND // 2 + 1)
     profile = radius * np.column_stack([np.cos(angles), np.sin(angles)])
     profile[[0, -1], 0] = 0.0
     moments = ball_moments(radius)
     nothing = np.zeros((0, 3)), np.zeros(0)
-    surface = turned_surface(profile, n_around=64)
+    surface = turned_surface(profile, n_around=AROUND)
     return Shape(moments.volume, moments.inertia, *surface, sphere_field(radius), *nothing, ball_radius=radius)
 
 
