@@ -15,6 +15,8 @@ from numba import njit
 
 from finqd.mechanics.distance_kernels import signed_distance
 
+OPPOSED = 0.1  # cosine: two surfaces push on each other only if they look at each other at least this much
+
 
 @njit(cache=True)
 def normal_energy(gap, stiffness, smoothing):
@@ -54,15 +56,26 @@ def face_point(positions, nodes, weight, point):
 
 
 @njit(cache=True)
+def face_normal(positions, nodes, corners, normal):
+    """Write the unit normal of a face with 3 or 4 corners."""
+    a, b = positions[nodes[1]] - positions[nodes[0]], positions[nodes[2]] - positions[nodes[0]]
+    if corners == 4:
+        a, b = positions[nodes[2]] - positions[nodes[0]], positions[nodes[3]] - positions[nodes[1]]
+    n = np.cross(a, b)
+    normal[:] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
+
+
+@njit(cache=True)
 def find_soft_rigid(
-    positions, faces, sample_face, sample_weight, sample_stiffness, centre, rotation, field, low, high,
+    positions, faces, face_corners, sample_face, sample_weight, sample_stiffness, centre, rotation, field, low, high,
     rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
 ):
     """Append the samples of soft faces that lie inside a rigid body; return the new count.
 
-    low, high: bounding box of the body in its own frame [m], shape (3,).
+    low, high: bounding box of the body in its own frame [m], shape (3,). A sample whose face does not look towards the
+    body's surface is left out: where two edges cross, its force would be that of the wrong side.
     """
-    x, y = np.empty(3), np.empty(3)
+    x, y, m, face_n = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for s in range(sample_face.shape[0]):
         f = sample_face[s]
         face_point(positions, faces[f], sample_weight[s], x)
@@ -79,12 +92,17 @@ def find_soft_rigid(
         d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
         if d >= 0.0:
             continue
+        for i in range(3):
+            m[i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
+        face_normal(positions, faces[f], face_corners[f], face_n)
+        if np.dot(m, face_n) > -OPPOSED:
+            continue
         out_key[count] = first_key + s
         out_face[count] = f
         out_weight[count] = sample_weight[s]
         out_gap[count] = d
         for i in range(3):
-            out_normal[count, i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
+            out_normal[count, i] = m[i]
             out_arm[count, i] = x[i] - centre[i]
         out_stiffness[count] = sample_stiffness[s]
         out_rigid[count] = rigid
@@ -94,11 +112,11 @@ def find_soft_rigid(
 
 @njit(cache=True)
 def find_soft_plane(
-    positions, faces, sample_face, sample_weight, sample_stiffness, point, normal, first_key,
+    positions, faces, face_corners, sample_face, sample_weight, sample_stiffness, point, normal, first_key,
     out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
 ):
-    """Append the samples of soft faces below a plane; return the new count."""
-    x = np.empty(3)
+    """Append the samples of soft faces below a plane, as `find_soft_rigid` does; return the new count."""
+    x, face_n = np.empty(3), np.empty(3)
     for s in range(sample_face.shape[0]):
         f = sample_face[s]
         face_point(positions, faces[f], sample_weight[s], x)
@@ -106,6 +124,9 @@ def find_soft_plane(
         for i in range(3):
             d += normal[i] * (x[i] - point[i])
         if d >= 0.0:
+            continue
+        face_normal(positions, faces[f], face_corners[f], face_n)
+        if np.dot(normal, face_n) > -OPPOSED:
             continue
         out_key[count] = first_key + s
         out_face[count] = f
@@ -237,14 +258,15 @@ def near_triangles(positions, faces, triangle_face, points, reach, low, high, pa
 
 @njit(cache=True)
 def find_feature_soft(
-    positions, faces, triangle_face, triangle_weight, pairs, points, feature_stiffness, centre, rotation, rigid,
+    positions, faces, triangle_face, triangle_weight, pairs, points, outward, feature_stiffness, centre, rotation, rigid,
     first_key, depth, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
 ):
     """Append the features of a rigid body that lie inside a soft body; return the new count.
 
     pairs: candidate (point, triangle) of one soft body, sorted by point; shape (n, 2). The gap of a point is the signed
     distance to the nearest triangle; where several are equally near (an edge), the one that faces the point most
-    decides the sign. Points deeper than ``depth`` [m] are left out: they are nearer to the wall's other side.
+    decides the sign. outward: unit pseudonormals of the features, body frame, shape (n, 3); a feature whose nearest
+    triangle does not look at it is left out, as in `find_soft_rigid`. Points deeper than ``depth`` [m] are left out: they are nearer to the wall's other side.
     """
     p, arm, bary, cp, best_n = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     corner, best_weight = np.empty((3, 3)), np.empty(faces.shape[1])
@@ -284,7 +306,11 @@ def find_feature_soft(
                     best_n[:] = n
                 else:
                     best_n[:] = delta / best_gap
-        if -depth < best_gap < 0.0:
+        facing_out = 0.0
+        for i in range(3):
+            for j in range(3):
+                facing_out -= best_n[i] * rotation[i, j] * outward[q, j]
+        if -depth < best_gap < 0.0 and facing_out > OPPOSED:
             out_key[count] = first_key + q
             out_face[count] = triangle_face[best_t]
             out_weight[count] = best_weight

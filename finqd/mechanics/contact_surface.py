@@ -15,14 +15,16 @@ from finqd.scene import SoftBody
 class ContactSurface:
     """Faces, samples and triangles of all soft bodies, in scene numbering.
 
-    faces: vertex ids, -1 pads, shape (n_faces, k); face_body: soft body of each face, shape (n_faces,)
+    faces: vertex ids, -1 pads, shape (n_faces, k); face_body, face_corners: soft body and number of corners (3 or 4) of
+        each face, shape (n_faces,)
     sample_face, sample_weight (n_samples, k), sample_area [m^2]: points that are finer than the mesh; points that
-        neighbouring faces share are merged
+        neighbouring faces share are merged, but not across a sharp edge, where each side needs its own normal
     triangle_face, triangle_weight (n_triangles, 3, k): faces cut into flat triangles, corners as weights on the face
     """
 
     faces: np.ndarray
     face_body: np.ndarray
+    face_corners: np.ndarray
     sample_face: np.ndarray
     sample_weight: np.ndarray
     sample_area: np.ndarray
@@ -82,13 +84,14 @@ def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(list(order), dtype=float) / n, share
 
 
-def _face_areas(points: np.ndarray, face_type: str) -> np.ndarray:
+def _face_vectors(points: np.ndarray, face_type: str) -> np.ndarray:
+    """Return area times unit normal of each face [m^2], shape (n_faces, 3)."""
     corners = points[:, : 4 if face_type.startswith("quad") else 3]
     if corners.shape[1] == 3:
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     else:
         cross = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    return 0.5 * np.linalg.norm(cross, axis=1)
+    return 0.5 * cross
 
 
 def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
@@ -105,9 +108,11 @@ def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
 
 def _samples(
     points: np.ndarray, face_type: str, first_face: int, spacing: float, width: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (face, weight, area, position) of all samples of one block of faces."""
-    cells, areas = _cells(points, face_type, spacing), _face_areas(points, face_type)
+) -> tuple[np.ndarray, ...]:
+    """Return (face, weight, area, position, normal) of all samples of one block of faces."""
+    cells, vectors = _cells(points, face_type, spacing), _face_vectors(points, face_type)
+    areas = np.linalg.norm(vectors, axis=1)
+    normals = vectors / areas[:, None]
     found: list[tuple[np.ndarray, ...]] = []
     for n, m in np.unique(cells, axis=0):
         local, share = lattice(face_type, int(n), int(m))
@@ -119,16 +124,17 @@ def _samples(
             (
                 np.repeat(which + first_face, len(local)), weight, np.outer(areas[which], share).ravel(),
                 np.einsum("pk,fkx->fpx", shape, points[which]).reshape(-1, 3),
+                np.repeat(normals[which], len(local), axis=0),
             )
         )
-    face, weight, area, position = (np.concatenate(part) for part in zip(*found, strict=True))
-    return face, weight, area, position
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
 
 
 def _merged(parts: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge samples of one body that coincide at rest (to a nanometre), adding their areas."""
-    face, weight, area, position = parts
-    _, first, inverse = np.unique(np.round(position, 9), axis=0, return_index=True, return_inverse=True)
+    """Merge samples of one body that coincide at rest (to a nanometre) on faces of like direction, adding their areas."""
+    face, weight, area, position, normal = parts
+    key = np.concatenate([np.round(position, 9), np.round(2.0 * normal)], axis=1)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return face[first], weight[first], np.bincount(inverse.ravel(), area)
 
 
@@ -136,7 +142,7 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
     """Return the surface of ``bodies`` with samples at most ``spacing`` [m] apart; faces that are held are left out."""
     kinds = [(body, kind) for body in bodies for kind, faces in sorted(body.mesh.faces.items()) if len(faces)]
     width = max((body.mesh.faces[kind].shape[1] for body, kind in kinds), default=4)
-    faces, face_body, samples, triangles = [], [], [], []
+    faces, face_body, face_corners, samples, triangles = [], [], [], [], []
     first_face = 0
     for number, body in enumerate(bodies):
         parts = []
@@ -149,6 +155,7 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
             padded[:, : block.shape[1]] = block + body.first_vertex
             faces.append(padded)
             face_body.append(np.full(len(block), number))
+            face_corners.append(np.full(len(block), 4 if kind.startswith("quad") else 3))
             parts.append(_samples(body.mesh.vertices[block], kind, first_face, spacing, width))
             corners = face_shape(kind, np.array(_TRIANGLES[kind], dtype=float).reshape(-1, 2)).reshape(-1, 3, block.shape[1])
             weight = np.zeros((len(block) * len(corners), 3, width))
@@ -160,13 +167,14 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
     if not faces:
         empty = np.zeros(0, dtype=np.int64)
         return ContactSurface(
-            faces=np.zeros((0, width), dtype=np.int64), face_body=empty, sample_face=empty,
+            faces=np.zeros((0, width), dtype=np.int64), face_body=empty, face_corners=empty, sample_face=empty,
             sample_weight=np.zeros((0, width)), sample_area=np.zeros(0), triangle_face=empty,
             triangle_weight=np.zeros((0, 3, width)),
         )
     sample_face, sample_weight, sample_area = (np.concatenate(p) for p in zip(*samples, strict=True))
     triangle_face, triangle_weight = (np.concatenate(p) for p in zip(*triangles, strict=True))
     return ContactSurface(
-        faces=np.concatenate(faces), face_body=np.concatenate(face_body), sample_face=sample_face,
-        sample_weight=sample_weight, sample_area=sample_area, triangle_face=triangle_face, triangle_weight=triangle_weight,
+        faces=np.concatenate(faces), face_body=np.concatenate(face_body), face_corners=np.concatenate(face_corners),
+        sample_face=sample_face, sample_weight=sample_weight, sample_area=sample_area, triangle_face=triangle_face,
+        triangle_weight=triangle_weight,
     )

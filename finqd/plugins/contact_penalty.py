@@ -11,6 +11,7 @@ from annotated_types import Gt, Le
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.contact_rows import FrictionRows, Rows
 from finqd.mechanics.contact_surface import contact_surface
+from finqd.mechanics.distance_kernels import signed_distances
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
 from finqd.mechanics.state import Direction, State
@@ -36,7 +37,7 @@ class Penalty:
     weight_penetration_mm: how far a rigid body sinks into the floor on one support point under its own weight
     """
 
-    stiffness_N_mm3: Annotated[float, Gt(0), Le(1e6)] = 100.0
+    stiffness_N_mm3: Annotated[float, Gt(0), Le(1e6)] = 300.0
     smoothing_mm: Annotated[float, Gt(0), Le(1)] = 0.01
     sample_spacing_mm: Annotated[float, Gt(0), Le(20)] = 1.5
     friction_stiffness_ratio: Annotated[float, Gt(0), Le(10)] = 0.5
@@ -64,6 +65,7 @@ class PenaltyContact:
         self.feature_stiffness = [
             stiffness * FEATURE_WIDTH * np.where(s.feature_lengths > 0.0, s.feature_lengths, CORNER_LENGTH) for s in shapes
         ]
+        self.feature_normals = [_outward(s) for s in shapes]
         # under weightless conditions a body still must not sink into a plane: 1 g stands in for gravity
         weight = max(float(np.linalg.norm(scene.gravity)), 9.81)
         self.support_stiffness = [s.mass * weight / (options.weight_penetration_mm * MM) for s in shapes]
@@ -226,7 +228,7 @@ class PenaltyContact:
         if self.last_rows_state is state:
             return
         rows, surface, scene = self.rows, self.surface, self.scene
-        samples = (surface.faces, surface.sample_face, surface.sample_weight, self.sample_stiffness)
+        samples = (surface.faces, surface.face_corners, surface.sample_face, surface.sample_weight, self.sample_stiffness)
         rows.count = 0
         self._renew_pairs(state)
         for r, body in enumerate(scene.rigid_bodies):
@@ -238,7 +240,7 @@ class PenaltyContact:
             for b, pairs in enumerate(self._pairs[r]):
                 rows.count = kernels.find_feature_soft(
                     state.positions, surface.faces, surface.triangle_face, surface.triangle_weight, pairs,
-                    body.shape.feature_points, self.feature_stiffness[r], *pose, r, self.first_key["feature", r, b],
+                    body.shape.feature_points, self.feature_normals[r], self.feature_stiffness[r], *pose, r, self.first_key["feature", r, b],
                     FEATURE_DEPTH, *rows.arrays, rows.count,
                 )
             for p, plane in enumerate(scene.planes):
@@ -292,6 +294,13 @@ def _box(shape: object) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -shape.ball_radius), np.full(3, shape.ball_radius)
     margin = 1e-3 * shape.bounding_radius  # a tessellation of a curved surface lies inside it
     return shape.vertices.min(axis=0) - margin, shape.vertices.max(axis=0) + margin
+
+
+def _outward(shape: object) -> np.ndarray:
+    """Return the unit pseudonormals of a shape's features, in its own frame, shape (n, 3)."""
+    distances, normals = np.empty(len(shape.feature_points)), np.empty((len(shape.feature_points), 3))
+    signed_distances(shape.distance, shape.feature_points, distances, normals)
+    return normals
 
 
 def _support_arms(shape: object, rotation: np.ndarray, normal: np.ndarray) -> np.ndarray:
