@@ -89,15 +89,14 @@ def load_object(
     """
     if mass_g is not None:
         mass_g = checked(Mass, mass_g, "mass_g")
-    text = source if isinstance(source, str) else ""
-    is_json = isinstance(source, Mapping) or text.lstrip().startswith("{")
-    if not is_json:
-        source = _path(source)
-        if source.suffix.lower() in SUFFIXES:
-            return _from_surface_file(source, mass_g, name)
-    document, where = read_json_object(source, kind="object")
-    folder = Path() if is_json else source.parent
-    return _from_json(document, where, folder, mass_g, name or ("object" if is_json else source.stem))
+    if isinstance(source, Mapping) or (isinstance(source, str) and source.lstrip().startswith("{")):
+        document, where = read_json_object(source, kind="object")
+        return _from_json(document, where, Path(), mass_g, name)
+    path = _path(source)
+    if path.suffix.lower() in SUFFIXES:
+        return _from_surface_file(path, mass_g, name)
+    document, where = read_json_object(path, kind="object")
+    return _from_json({"name": _plain_name(path.stem), **document}, where, path.parent, mass_g, name)
 
 
 def _path(source: str | os.PathLike[str]) -> Path:
@@ -130,12 +129,14 @@ def _from_surface_file(path: Path, mass_g: float | None, name: str | None) -> Gr
     return _placed(_plain_name(name or path.stem), shape, mass, np.eye(3), None, assumptions)
 
 
-def _from_json(document: Mapping[str, Any], where: str, folder: Path, mass_g: float | None, name: str) -> GraspObject:
+def _from_json(
+    document: Mapping[str, Any], where: str, folder: Path, mass_g: float | None, name: str | None
+) -> GraspObject:
     refuse_unknown(document, KEYS, where)
     if "shape" not in document:
         kinds = ", ".join(KINDS)
         raise InputError(f'is missing, as in "shape": {{"kind": ...}} with one of {kinds}', join(where, "shape"))
-    label = document.get("name", name)
+    label = document.get("name", "object") if name is None else name
     if not isinstance(label, str) or label != _plain_name(label):
         allowed = "must be a text of 1 to 60 letters, digits, '-', '_' and '.'"
         raise InputError(f"{allowed}, not {shown(label)}", join(where, "name"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, SURFACE, DistanceField
@@ -108,7 +110,7 @@ def edge_table(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return np.column_stack([keys // n, keys % n]), edge_of.reshape(-1, 3), counts
 
 
-def _field(**given) -> DistanceField:
+def _field(**given: Any) -> DistanceField:
     """Fill what is not given with empty arrays, and fix types and memory order: one Numba type for all shapes."""
     columns = {"rows": 12, "features": 6, "pseudonormals": 3, "boxes": 6}
     arrays = {
