@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from finqd.scene import Scene
 
 RUBBER = Material(youngs_modulus=1e6, poisson_ratio=0.45, density=1000.0)
-SIZE = np.array([0.03, 0.02, 0.01])  # of the test box [m]
+SIZE = (0.03, 0.02, 0.01)  # of the test box [m]
 ELEMENTS = ("hex8", "wedge6", "tet4", "tet10")
 GRAVITY = 9.81  # [m/s^2]
 SINKING_LIMIT = 1e-4  # how far a resting body may sink into a plane [m]
@@ -60,7 +60,7 @@ def check_gradient_is_of_the_energy(kind: str, name: str) -> None:
         assert np.isclose(energy, potential.energy(positions), rtol=1e-12), f"{element}: two energies of one state"
         assert energy > 0.0, f"{element}: a strained body stores {energy:.3g} J"
         for direction in _directions(mesh):
-            h = 1e-6 * SIZE.min()
+            h = 1e-6 * min(SIZE)
             ahead, behind = (potential.energy(positions + step * direction) for step in (h, -h))
             slope, given = (ahead - behind) / (2 * h), float(np.vdot(gradient, direction))
             off = abs(given - slope) / np.abs(gradient).max()
@@ -79,7 +79,7 @@ def check_hessian_is_of_the_gradient(kind: str, name: str) -> None:
         scale = np.abs(exact).max()
         assert np.abs(exact - exact.T).max() < 1e-9 * scale, f"{element}: the Hessian is not symmetric"
         for direction in _directions(mesh):
-            h = 1e-6 * SIZE.min()
+            h = 1e-6 * min(SIZE)
             ahead, behind = np.zeros_like(positions), np.zeros_like(positions)
             potential.add_gradient(positions + h * direction, ahead)
             potential.add_gradient(positions - h * direction, behind)
@@ -150,7 +150,7 @@ def check_repeats_itself(kind: str, name: str) -> None:
         ends.append(states[-1].positions)
         for state, copy in zip(states, copies, strict=True):
             assert np.array_equal(state.positions, copy), "a step wrote into the state that it started from"
-    assert np.array_equal(*ends), "the same scene gave another result"
+    assert np.array_equal(ends[0], ends[1]), "the same scene gave another result"
 
 
 STEPPER = (check_falls_freely, check_holds_what_is_fixed, check_repeats_itself)
@@ -217,7 +217,7 @@ def _energy_scale() -> float:
 
 
 def _force_scale() -> float:
-    return _energy_scale() / float(SIZE.max())
+    return _energy_scale() / max(SIZE)
 
 
 def _rotation(angle: float) -> np.ndarray:
@@ -229,7 +229,7 @@ def _rotation(angle: float) -> np.ndarray:
 def _strained(mesh: Mesh) -> np.ndarray:
     """Return positions that are turned by 0.8 rad and strained by a few per cent, at random."""
     noise = np.random.default_rng(1).uniform(-1.0, 1.0, mesh.vertices.shape)
-    return mesh.vertices @ _rotation(0.8).T + 0.02 * SIZE.min() * noise
+    return mesh.vertices @ _rotation(0.8).T + 0.02 * min(SIZE) * noise
 
 
 def _squeezed(mesh: Mesh) -> np.ndarray:

@@ -22,7 +22,8 @@ def written_at_end(path: Path | None, option: str) -> Iterator[Callable[[str], N
     if path is None:
         yield lambda text: None
     elif path.exists() and not path.is_file() and not path.is_dir():  # /dev/stdout, a pipe: nothing to rename
-        yield lambda text: path.write_text(text, encoding="utf-8") and None
+        with path.open("w", encoding="utf-8") as file:
+            yield lambda text: print(text, end="", file=file)
     else:
         temporary = _temporary_beside(path, option)
         try:

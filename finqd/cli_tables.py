@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.markup import escape
+from rich.padding import Padding
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
     console.print(f"fitness {fitness} ({held} of {len(objects)} held), margin {margin}")
     for part in ("features", "mesh", "effects", "timings", "assumptions"):
         _print_part(console, part, result.get(part))
+    _print_part(console, "protocol", result.get("design", {}).get("protocol"))
 
 
 def print_search(result: SearchResult) -> None:
@@ -126,22 +128,29 @@ def _option_line(option: Option) -> str:
 
 
 def _print_part(console: Console, title: str, part: Any) -> None:
-    """Print a part of the result that is a mapping or a list, one line an entry."""
+    """Print a part of the result: numbers in a row, sentences one a line."""
     if not part:
         return
-    console.print(f"[bold]{title}[/bold]")
-    for line in _entry_lines(part):
-        console.print(f"    {escape(line)}", soft_wrap=True)
-
-
-def _entry_lines(part: Any, prefix: str = "") -> list[str]:
     if isinstance(part, Mapping):
-        stem = f"{prefix}." if prefix else ""
-        return [line for key, value in part.items() for line in _entry_lines(value, f"{stem}{key}")]
-    if isinstance(part, (list, tuple)) and any(isinstance(value, (Mapping, str)) for value in part):
-        return [line for value in part for line in _entry_lines(value, prefix)]
-    text = f"{part:.6g}" if isinstance(part, float) else str(part)
-    return [f"{prefix} = {text}" if prefix else text]
+        entries = [f"{key} = {_value(value)}" for key, value in _flat(part).items()]
+    else:
+        entries = [str(entry) for entry in part]
+    prose = any(" " in entry.partition(" = ")[2] or " = " not in entry for entry in entries)
+    console.print(f"[bold]{title}[/bold]")
+    for line in entries if prose else [", ".join(entries)]:
+        console.print(Padding(escape(line), (0, 0, 0, 4), expand=False))
+
+
+def _flat(part: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested mappings as one, with dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in part.items():
+        found.update(_flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value})
+    return found
+
+
+def _value(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _table(*titles: str) -> Table:

@@ -33,11 +33,11 @@ def box_mesh(
     distort: the inner corner nodes move by up to this share of a brick's edges, at random from ``seed``.
     Node and face sets are ``xmin``, ``xmax``, ``ymin``, ``ymax``, ``zmin``, ``zmax``.
     """
-    size, counts = np.asarray(size, dtype=float), np.asarray(divisions, dtype=int)
-    axes = [np.linspace(0.0, length, count + 1) for length, count in zip(size, counts, strict=True)]
+    lengths, counts = np.asarray(size, dtype=float), np.asarray(divisions, dtype=int)
+    axes = [np.linspace(0.0, length, count + 1) for length, count in zip(lengths, counts, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     if distort:
-        moves = np.random.default_rng(seed).uniform(-1.0, 1.0, grid.shape) * distort * size / counts
+        moves = np.random.default_rng(seed).uniform(-1.0, 1.0, grid.shape) * distort * lengths / counts
         grid[1:-1, 1:-1, 1:-1] += moves[1:-1, 1:-1, 1:-1]
     vertices, bricks = grid.reshape(-1, 3), _bricks(counts)
     if element in ("tet4", "tet10"):
@@ -50,7 +50,7 @@ def box_mesh(
         raise ValueError(f"unknown element type {element!r}: hex8, hex20, wedge6, tet4 or tet10")
     if element in MID_EDGES:
         mesh = quadratic(mesh)
-    return _with_plane_sets(mesh, size)
+    return _with_plane_sets(mesh, lengths)
 
 
 def quadratic(mesh: Mesh) -> Mesh:

@@ -58,7 +58,7 @@ def names(kind: str) -> list[str]:
     return sorted({entry.name for entry in entries(kind)})
 
 
-def load(kind: str, name: str, *, where: str = "") -> type:
+def load(kind: str, name: str, *, where: str = "") -> Any:
     """Return the plugin class registered as ``name``, importing it and nothing else.
 
     Raises ``PluginError``, with ``where`` in front: unknown (lists the known), registered by two distributions, not

@@ -145,7 +145,7 @@ class SoftBody:
 
     def fix(self, where: str | np.ndarray, axes: Sequence[int] = (0, 1, 2)) -> None:
         """Hold vertices at their start positions along ``axes``."""
-        self.fixed[np.ix_(self.vertices(where), list(axes))] = True
+        self.fixed[np.ix_(self.vertices(where), np.asarray(axes, dtype=int))] = True
 
     def drive(self, where: str | np.ndarray, motion: Motion) -> None:
         """Prescribe the motion of vertices."""
@@ -260,7 +260,8 @@ class Scene:
     @property
     def names(self) -> set[str]:
         """Names of all bodies and planes."""
-        return {thing.name for thing in (*self.soft_bodies, *self.rigid_bodies, *self.planes)}
+        things: list[SoftBody | RigidBody | Plane] = [*self.soft_bodies, *self.rigid_bodies, *self.planes]
+        return {thing.name for thing in things}
 
     @property
     def n_vertices(self) -> int:

@@ -59,7 +59,7 @@ class _Recorder:
 
     def trajectory(self, **rest: Any) -> Trajectory:
         """Return everything collected."""
-        arrays = {key: np.array(value) for key, value in self.rows.items()}
+        arrays: dict[str, Any] = {key: np.array(value) for key, value in self.rows.items()}
         energies = {key: arrays.pop(key) for key in ("kinetic", "elastic")}
         soft = arrays.pop("soft_positions", np.zeros((0, 0, 3)))
         times = arrays["times"] if self.record else np.zeros(0)
