@@ -342,11 +342,14 @@ def test_a_cantilever_converges_at_the_elements_rate(name, levels, rate, error):
     assert errors[-1].max() < error, errors
 
 
-def bending_ratio(name: str, layers: int, poisson: float) -> float:
-    """Tip displacement of a slender cantilever over beam theory (Timoshenko's, clamped root)."""
+def bending_ratio(name: str, layers: int, poisson: float, *, across: int = 1) -> float:
+    """Tip displacement of a slender cantilever, thin along axis ``across``, over beam theory (Timoshenko's)."""
     length, depth, width, modulus = 0.08, 0.008, 0.02, 1e6
-    mesh = box_mesh((length, depth, width), (8 * layers, layers, layers), name)
-    load = face_tractions(mesh, "xmax", (0.0, -1.0 / (depth * width), 0.0))
+    size, divisions = (length, width, depth), (8 * layers, 2 * layers, layers)
+    if across == 1:
+        size, divisions = (length, depth, width), (8 * layers, layers, layers)
+    mesh = box_mesh(size, divisions, name)
+    load = face_tractions(mesh, "xmax", -np.eye(3)[across] / (depth * width))
     root = mesh.node_sets["xmin"]
     material = Material(youngs_modulus=modulus, poisson_ratio=poisson, density=1.0)
     found = displacements(mesh, material, load, root, np.zeros((len(root), 3)))
@@ -361,6 +364,12 @@ def test_thin_walls_bend_with_one_hexahedron_through_them_and_lock_with_one_tetr
     assert bending_ratio("tet10", 2, 0.49) > 0.85
     assert bending_ratio("tet4", 1, 0.49) < 0.05
     assert bending_ratio("wedge6", 1, 0.49) > 3 * bending_ratio("tet4", 1, 0.49)
+
+
+def test_wedges_bend_out_of_their_triangles_plane_and_are_never_too_soft():
+    ratios = [bending_ratio("wedge6", layers, 0.49, across=2) for layers in (1, 2, 4)]
+    assert 0.55 < ratios[0] < ratios[1] < ratios[2] < 1.0
+    assert ratios[2] > 0.85
 
 
 @pytest.mark.parametrize("name", ["hex8", "tet4", "tet10"])
