@@ -261,9 +261,7 @@ def _check(*, objects: Any, preset: str, ranges: qd.Ranges | None, **numbers: An
     for name, (low, high) in (ranges or {}).items():
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise InputError(f"must be a low and a higher number, got {low!r} and {high!r}", where=f"ranges.{name}")
-    known = bundled_names(objects_folder())
-    if objects is not None and not len(objects):
-        raise InputError(f"names no object; known: {', '.join(known)}", where="objects")
-    for one in objects or ():
-        if isinstance(one, (str, Path)) and str(one) not in known and not Path(one).is_file():
-            raise InputError(f"there is no object {str(one)!r}; known: {', '.join(known)}", where="objects")
+    if objects is not None:
+        from finqd.evaluate import load_objects
+
+        load_objects(objects)

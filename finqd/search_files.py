@@ -77,8 +77,9 @@ def settings_of(
 @cache
 def versions() -> Mapping[str, str]:
     """Return the versions that a result depends on."""
-    names = ("finqd", "ribs", "numpy", "numba", "scipy")
-    return {"python": sys.version.split()[0], **{name: version(name) for name in names}}
+    from finqd.evaluate import versions as versions_of_simulation
+
+    return {"python": sys.version.split()[0], "ribs": version("ribs"), **versions_of_simulation()}
 
 
 def write_archive(

@@ -223,8 +223,11 @@ class _Worker:
             return TaskFailure(kind="crash", reason=f"the worker process was killed by {name}{hint}")
         return TaskFailure(kind="crash", reason=f"the worker process ended with exit code {code}")
 
-    def kill(self) -> None:
+    def end(self) -> None:
+        """End the process: by itself if it is idle, else at once."""
         self.pipe.close()
+        if self.index is None:
+            self.process.join(2.0)
         self.process.kill()  # its own children notice and go as well: see `_die_with_parent`
         self.process.join()
         self.process.close()
@@ -246,13 +249,13 @@ def _run_in_workers(
                 if not _serve(worker, board, time_limit_s):
                     with _interrupts_blocked():
                         workers.remove(worker)
-                        worker.kill()
+                        worker.end()
                 elif worker.index is None and waiting:
                     worker.assign(*waiting.popleft(), time_limit_s)
     finally:
         with _interrupts_blocked():  # a second Ctrl-C must not stop the cleaning up after the first
             for worker in workers:
-                worker.kill()
+                worker.end()
 
 
 def _ready(workers: Sequence[_Worker]) -> list[_Worker]:
@@ -277,7 +280,7 @@ def _serve(worker: _Worker, board: _Board, time_limit_s: float | None) -> bool:
             index, worker.index = worker.index, None
             board.put(index, _unpacked(value))
         elif kind == "dead" or time.monotonic() >= worker.deadline:
-            index, worker.index = worker.index, None
+            index = worker.index
             late = TaskFailure(kind="timeout", reason=f"stopped after its time limit of {time_limit_s} s")
             board.put(index, worker.crash() if kind == "dead" else late)
             return False

@@ -367,8 +367,9 @@ def test_a_feature_that_does_not_vary_still_has_an_axis():
         ({"jobs": 0}, "jobs: must be a whole number from 1 upwards, got 0"),
         ({"time_limit_s": -1.0}, "time_limit_s: must be a positive number of seconds, got -1.0"),
         ({"preset": "best"}, "preset: there is no preset 'best'; known: draft, standard, fine"),
-        ({"objects": ["banana"]}, "objects: there is no object 'banana'; known: "),
-        ({"objects": []}, "objects: names no object; known: "),
+        ({"objects": ["banana"]}, '"banana": no object has this name; known: cube, '),
+        ({"objects": []}, "objects: no object"),
+        ({"objects": ["cube", "cube"]}, "objects: each object once, please: cube"),
         ({"ranges": {"volume_mm3": (5.0, 5.0)}}, "ranges.volume_mm3: must be a low and a higher number, got 5.0 and"),
     ],
 )
