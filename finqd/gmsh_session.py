@@ -18,7 +18,6 @@ _OPTIONS = {
     "Mesh.MaxNumThreads2D": 1,
     "Mesh.MaxNumThreads3D": 1,
     "Mesh.MeshSizeExtendFromBoundary": 1,
-    "Geometry.Tolerance": 1e-10,
 }
 
 
