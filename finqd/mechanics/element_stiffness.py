@@ -88,7 +88,9 @@ def strain_matrix(gradients: np.ndarray) -> np.ndarray:
     return b.reshape(*gradients.shape[:-2], 6, 3 * k)
 
 
-def _rest_chunk(kind: Element, vertices: np.ndarray, material: np.ndarray, start: int):
+def _rest_chunk(
+    kind: Element, vertices: np.ndarray, material: np.ndarray, start: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     gradients, weights = physical_gradients(kind, vertices, kind.points, kind.weights)
     if not np.all(weights > 0):
         bad = start + int(np.argmax(~np.all(weights > 0, axis=1)))

@@ -12,7 +12,7 @@ array([[0.25, 0.25, 0.25, 0.25]])
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import product
@@ -119,7 +119,7 @@ def _between(nodes: Iterable[Iterable[float]], edges: Iterable[tuple[int, int]])
     return np.vstack([corners, [(corners[i] + corners[j]) / 2 for i, j in edges]])
 
 
-def _powers(dimension: int, highest: int, keep) -> np.ndarray:
+def _powers(dimension: int, highest: int, keep: Callable[[tuple[int, ...]], bool]) -> np.ndarray:
     return np.array([e for e in product(range(highest + 1), repeat=dimension) if keep(e)])
 
 
@@ -140,7 +140,9 @@ _HEX_FACES = ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 
 _TET_FACES = ((0, 1, 3), (1, 2, 3), (0, 3, 2), (0, 2, 1))
 
 
-def _with_edge_nodes(faces, edges, corners: int) -> tuple[tuple[int, ...], ...]:
+def _with_edge_nodes(
+    faces: Sequence[tuple[int, ...]], edges: Sequence[tuple[int, int]], corners: int
+) -> tuple[tuple[int, ...], ...]:
     number = {frozenset(edge): corners + i for i, edge in enumerate(edges)}
     return tuple(
         face + tuple(number[frozenset((face[i], face[(i + 1) % len(face)]))] for i in range(len(face)))
@@ -148,7 +150,7 @@ def _with_edge_nodes(faces, edges, corners: int) -> tuple[tuple[int, ...], ...]:
     )
 
 
-def _faces(face_type: str, faces) -> tuple[tuple[str, tuple[int, ...]], ...]:
+def _faces(face_type: str, faces: Sequence[tuple[int, ...]]) -> tuple[tuple[str, tuple[int, ...]], ...]:
     return tuple((face_type, tuple(f)) for f in faces)
 
 
