@@ -138,11 +138,14 @@ class ContactPotential(Protocol):
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J]."""
 
-    def add_derivatives(self, state: State, derivatives: Derivatives, *, hessian: bool) -> float:
-        """Add gradient (and a positive semidefinite Hessian) to ``derivatives``, return the energy [J].
+    def add_gradient(self, state: State, derivatives: Derivatives) -> float:
+        """Add the gradient to ``derivatives``, return the energy [J].
 
         Coulomb friction has no potential: its bounds are lagged, and at fixed bounds it is one.
         """
+
+    def add_hessian(self, state: State, derivatives: Derivatives) -> None:
+        """Add a positive semidefinite Hessian to ``derivatives``."""
 
     def step_limit(self, state: State, direction: Direction) -> float:
         """Return the largest share (0, 1] of ``direction`` in which no contact can tunnel through."""

@@ -77,7 +77,6 @@ def grasp_scene(task: GraspTask) -> tuple[Scene, RigidBody]:
 def overlapping_finger(scene: Scene, grasped: RigidBody) -> str | None:
     """Return the name of a finger that the object overlaps at the start, or None."""
     from finqd.collision import overlaps
-    from finqd.mesh_sets import surface_triangles
 
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = grasped.rotation, grasped.position
@@ -85,8 +84,8 @@ def overlapping_finger(scene: Scene, grasped: RigidBody) -> str | None:
         low, high = finger.mesh.vertices.min(axis=0), finger.mesh.vertices.max(axis=0)
         reach = grasped.shape.bounding_radius
         if np.all(low <= grasped.position + reach) and np.all(high >= grasped.position - reach):
-            surface = (finger.mesh.vertices, surface_triangles(finger.mesh))
-            if overlaps(*surface, np.eye(4), grasped.shape.vertices, grasped.shape.triangles, pose):
+            surface = (finger.mesh.vertices, finger.mesh.surface_triangles(), np.eye(4))
+            if overlaps(surface, (grasped.shape.vertices, grasped.shape.triangles, pose)):
                 return finger.name
     return None
 

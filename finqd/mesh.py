@@ -117,6 +117,15 @@ class Mesh:
             copy.__dict__["faces"] = self.faces
         return copy
 
+    def surface_triangles(self) -> np.ndarray:
+        """Return the boundary as flat triangles between corner vertices, outward, shape (n, 3)."""
+        triangles = [np.zeros((0, 3), dtype=np.int64)]
+        for kind, faces in self.faces.items():
+            triangles.append(faces[:, :3])
+            if kind.startswith("quad"):
+                triangles.append(faces[:, [0, 2, 3]])
+        return np.concatenate(triangles)
+
     def to_meshio(self) -> Any:
         """Return a ``meshio.Mesh``, with node sets as point sets."""
         import meshio

@@ -56,6 +56,22 @@ def face_point(positions, nodes, weight, point):
 
 
 @njit(cache=True)
+def face_box(positions, nodes, low, high):
+    """Write a box that holds all points of a face: its vertices' box, grown by an eighth for faces that bulge [m]."""
+    for i in range(3):
+        low[i], high[i] = np.inf, -np.inf
+        for a in range(nodes.shape[0]):
+            n = nodes[a]
+            if n >= 0:
+                low[i] = min(low[i], positions[n, i])
+                high[i] = max(high[i], positions[n, i])
+    grow = 0.125 * max(high[0] - low[0], high[1] - low[1], high[2] - low[2])
+    for i in range(3):
+        low[i] -= grow
+        high[i] += grow
+
+
+@njit(cache=True)
 def face_normal(positions, nodes, corners, normal):
     """Write the unit normal of a face with 3 or 4 corners."""
     a, b = positions[nodes[1]] - positions[nodes[0]], positions[nodes[2]] - positions[nodes[0]]
@@ -67,76 +83,90 @@ def face_normal(positions, nodes, corners, normal):
 
 @njit(cache=True)
 def find_soft_rigid(
-    positions, faces, face_corners, sample_face, sample_weight, sample_stiffness, centre, rotation, field, low, high,
-    rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+    positions, faces, face_corners, first_sample, sample_weight, sample_stiffness, centre, rotation, field, low, high,
+    radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
 ):
     """Append the samples of soft faces that lie inside a rigid body; return the new count.
 
-    low, high: bounding box of the body in its own frame [m], shape (3,). A sample whose face does not look towards the
+    low, high: bounding box of the body in its own frame, shape (3,); radius: of its bounding ball [m]. A sample whose face does not look towards the
     body's surface is left out: where two edges cross, its force would be that of the wrong side.
     """
     x, y, m, face_n = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for s in range(sample_face.shape[0]):
-        f = sample_face[s]
-        face_point(positions, faces[f], sample_weight[s], x)
-        inside = True
+    face_low, face_high = np.empty(3), np.empty(3)
+    for f in range(faces.shape[0]):
+        face_box(positions, faces[f], face_low, face_high)
+        apart = False
         for i in range(3):
-            y[i] = 0.0
-            for j in range(3):
-                y[i] += rotation[j, i] * (x[j] - centre[j])
-            if y[i] < low[i] or y[i] > high[i]:
-                inside = False
-                break
-        if not inside:
+            if face_low[i] > centre[i] + radius or face_high[i] < centre[i] - radius:
+                apart = True
+        if apart:
             continue
-        d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
-        if d >= 0.0:
-            continue
-        for i in range(3):
-            m[i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
-        face_normal(positions, faces[f], face_corners[f], face_n)
-        if np.dot(m, face_n) > -OPPOSED:
-            continue
-        out_key[count] = first_key + s
-        out_face[count] = f
-        out_weight[count] = sample_weight[s]
-        out_gap[count] = d
-        for i in range(3):
-            out_normal[count, i] = m[i]
-            out_arm[count, i] = x[i] - centre[i]
-        out_stiffness[count] = sample_stiffness[s]
-        out_rigid[count] = rigid
-        count += 1
+        for s in range(first_sample[f], first_sample[f + 1]):
+            face_point(positions, faces[f], sample_weight[s], x)
+            inside = True
+            for i in range(3):
+                y[i] = 0.0
+                for j in range(3):
+                    y[i] += rotation[j, i] * (x[j] - centre[j])
+                if y[i] < low[i] or y[i] > high[i]:
+                    inside = False
+                    break
+            if not inside:
+                continue
+            d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
+            if d >= 0.0:
+                continue
+            for i in range(3):
+                m[i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
+            face_normal(positions, faces[f], face_corners[f], face_n)
+            if np.dot(m, face_n) > -OPPOSED:
+                continue
+            out_key[count] = first_key + s
+            out_face[count] = f
+            out_weight[count] = sample_weight[s]
+            out_gap[count] = d
+            for i in range(3):
+                out_normal[count, i] = m[i]
+                out_arm[count, i] = x[i] - centre[i]
+            out_stiffness[count] = sample_stiffness[s]
+            out_rigid[count] = rigid
+            count += 1
     return count
 
 
 @njit(cache=True)
 def find_soft_plane(
-    positions, faces, face_corners, sample_face, sample_weight, sample_stiffness, point, normal, first_key,
+    positions, faces, face_corners, first_sample, sample_weight, sample_stiffness, point, normal, first_key,
     out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
 ):
     """Append the samples of soft faces below a plane, as `find_soft_rigid` does; return the new count."""
-    x, face_n = np.empty(3), np.empty(3)
-    for s in range(sample_face.shape[0]):
-        f = sample_face[s]
-        face_point(positions, faces[f], sample_weight[s], x)
-        d = 0.0
+    x, face_n, face_low, face_high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for f in range(faces.shape[0]):
+        face_box(positions, faces[f], face_low, face_high)
+        lowest = 0.0
         for i in range(3):
-            d += normal[i] * (x[i] - point[i])
-        if d >= 0.0:
+            lowest += normal[i] * ((face_low[i] if normal[i] > 0.0 else face_high[i]) - point[i])
+        if lowest >= 0.0:
             continue
-        face_normal(positions, faces[f], face_corners[f], face_n)
-        if np.dot(normal, face_n) > -OPPOSED:
-            continue
-        out_key[count] = first_key + s
-        out_face[count] = f
-        out_weight[count] = sample_weight[s]
-        out_gap[count] = d
-        out_normal[count] = normal
-        out_arm[count] = 0.0
-        out_stiffness[count] = sample_stiffness[s]
-        out_rigid[count] = -1
-        count += 1
+        for s in range(first_sample[f], first_sample[f + 1]):
+            face_point(positions, faces[f], sample_weight[s], x)
+            d = 0.0
+            for i in range(3):
+                d += normal[i] * (x[i] - point[i])
+            if d >= 0.0:
+                continue
+            face_normal(positions, faces[f], face_corners[f], face_n)
+            if np.dot(normal, face_n) > -OPPOSED:
+                continue
+            out_key[count] = first_key + s
+            out_face[count] = f
+            out_weight[count] = sample_weight[s]
+            out_gap[count] = d
+            out_normal[count] = normal
+            out_arm[count] = 0.0
+            out_stiffness[count] = sample_stiffness[s]
+            out_rigid[count] = -1
+            count += 1
     return count
 
 
@@ -336,7 +366,7 @@ def normal_contacts_energy(gap, stiffness, smoothing, count):
 @njit(cache=True)
 def _add_row(
     faces, face_slots, face, weight, rigid, spin, force, matrix, gradient, rigid_gradient,
-    blocks, coupling, rigid_matrix, want_hessian,
+    blocks, coupling, rigid_matrix, want_gradient, want_hessian,
 ):
     """Add the force -> gradient and the 3 x 3 ``matrix`` -> Hessian of one contact.
 
@@ -344,13 +374,13 @@ def _add_row(
     ``force`` is dE/dw, shape (3,).
     """
     k = faces.shape[1]
-    if face >= 0:
+    if want_gradient and face >= 0:
         for a in range(k):
             n = faces[face, a]
             if n >= 0:
                 for i in range(3):
                     gradient[n, i] += weight[a] * force[i]
-    if rigid >= 0:
+    if want_gradient and rigid >= 0:
         for i in range(3):
             rigid_gradient[rigid, i] -= force[i]
             for j in range(3):
@@ -390,9 +420,9 @@ def _add_row(
 @njit(cache=True)
 def add_normal(
     faces, face_slots, face, weight, gap, normal, arm, stiffness, rigid, count, smoothing,
-    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_hessian,
+    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_gradient, want_hessian,
 ):
-    """Add gradient and (Gauss-Newton, so positive semidefinite) Hessian of the penalty; return the energy [J]."""
+    """Add gradient and (Gauss-Newton, so positive semidefinite) Hessian of the penalty, as wanted; return the energy [J]."""
     energy = 0.0
     spin, matrix, force = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
     for c in range(count):
@@ -409,7 +439,7 @@ def add_normal(
         spin[2, 0], spin[2, 1] = -arm[c, 1], arm[c, 0]
         _add_row(
             faces, face_slots, face[c], weight[c], rigid[c], spin, force, matrix, gradient, rigid_gradient,
-            blocks, coupling, rigid_matrix, want_hessian,
+            blocks, coupling, rigid_matrix, want_gradient, want_hessian,
         )
     return energy
 
@@ -465,7 +495,7 @@ def friction_energy(slips, bound, stiffness, count):
 @njit(cache=True)
 def add_friction(
     faces, face_slots, face, weight, slips, bound, stiffness, normal, start_arm, rigid, turn_jacobian, count,
-    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_hessian,
+    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_gradient, want_hessian,
 ):
     """Add gradient and Hessian (both exact, for the lagged normal forces) of `friction_energy`.
 
@@ -492,7 +522,7 @@ def add_friction(
             spin = arm @ turn_jacobian[rigid[c]]
         _add_row(
             faces, face_slots, face[c], weight[c], rigid[c], spin, force, matrix, gradient, rigid_gradient,
-            blocks, coupling, rigid_matrix, want_hessian,
+            blocks, coupling, rigid_matrix, want_gradient, want_hessian,
         )
 
 

@@ -17,6 +17,7 @@ class ContactSurface:
 
     faces: vertex ids, -1 pads, shape (n_faces, k); face_body, face_corners: soft body and number of corners (3 or 4) of
         each face, shape (n_faces,)
+    first_sample: samples first_sample[f] to first_sample[f + 1] lie on face f, shape (n_faces + 1,)
     sample_face, sample_weight (n_samples, k), sample_area [m^2]: points that are finer than the mesh; points that
         neighbouring faces share are merged, but not across a sharp edge, where each side needs its own normal
     triangle_face, triangle_weight (n_triangles, 3, k): faces cut into flat triangles, corners as weights on the face
@@ -25,6 +26,7 @@ class ContactSurface:
     faces: np.ndarray
     face_body: np.ndarray
     face_corners: np.ndarray
+    first_sample: np.ndarray
     sample_face: np.ndarray
     sample_weight: np.ndarray
     sample_area: np.ndarray
@@ -167,14 +169,17 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
     if not faces:
         empty = np.zeros(0, dtype=np.int64)
         return ContactSurface(
-            faces=np.zeros((0, width), dtype=np.int64), face_body=empty, face_corners=empty, sample_face=empty,
+            faces=np.zeros((0, width), dtype=np.int64), face_body=empty, face_corners=empty,
+            first_sample=np.zeros(1, dtype=np.int64), sample_face=empty,
             sample_weight=np.zeros((0, width)), sample_area=np.zeros(0), triangle_face=empty,
             triangle_weight=np.zeros((0, 3, width)),
         )
     sample_face, sample_weight, sample_area = (np.concatenate(p) for p in zip(*samples, strict=True))
+    order = np.argsort(sample_face, kind="stable")
+    sample_face, sample_weight, sample_area = sample_face[order], sample_weight[order], sample_area[order]
     triangle_face, triangle_weight = (np.concatenate(p) for p in zip(*triangles, strict=True))
     return ContactSurface(
         faces=np.concatenate(faces), face_body=np.concatenate(face_body), face_corners=np.concatenate(face_corners),
-        sample_face=sample_face, sample_weight=sample_weight, sample_area=sample_area, triangle_face=triangle_face,
+        first_sample=np.searchsorted(sample_face, np.arange(first_face + 1)), sample_face=sample_face, sample_weight=sample_weight, sample_area=sample_area, triangle_face=triangle_face,
         triangle_weight=triangle_weight,
     )

@@ -70,27 +70,31 @@ class EulerIncrement:
         """Return the incremental potential [J]."""
         return self._inertia_energy(state, self._turns(state)) + self.system.energy(state)
 
-    def derive(self, state: State, *, hessian: bool, projected: bool = False) -> float:
-        """Fill the system's derivatives, fixed degrees of freedom held; return the energy [J]."""
-        system, d, dt = self.system, self.system.derivatives, self.dt
+    def gradient(self, state: State) -> float:
+        """Fill the gradient in the system's derivatives, zero where held; return the energy [J]."""
+        system, d = self.system, self.system.derivatives
+        d.clear_gradient()
         turns = self._turns(state)
-        energy = system.derive(state, hessian=hessian, projected=projected) + self._inertia_energy(state, turns)
+        energy = system.add_gradient(state) + self._inertia_energy(state, turns)
         d.soft += self.vertex_weight * (state.positions - self.inertial)
-        d.rigid[:, :3] += (system.rigid_masses / dt**2)[:, None] * (state.rigid_positions - self.rigid_inertial)
-        if hessian:
-            add_diagonal(system.pattern.indptr, system.pattern.indices, system.masses / dt**2, d.blocks)
-        for b in range(system.n_rigid):
-            jacobian = inverse_left_jacobian(turns[b])
-            d.rigid[b, 3:] += jacobian.T @ self.inertias[b] @ (turns[b] - self.spins[b]) / dt**2
-            if hessian:
-                r = 6 * b
-                d.rigid_matrix[r : r + 3, r : r + 3] += np.eye(3) * system.rigid_masses[b] / dt**2
-                d.rigid_matrix[r + 3 : r + 6, r + 3 : r + 6] += jacobian.T @ self.inertias[b] @ jacobian / dt**2
-        if hessian:
-            system.hold_fixed()
-        else:
-            d.soft[system.fixed] = 0.0
+        d.rigid[:, :3] += (system.rigid_masses / self.dt**2)[:, None] * (state.rigid_positions - self.rigid_inertial)
+        for b, turn in enumerate(turns):
+            d.rigid[b, 3:] += inverse_left_jacobian(turn).T @ self.inertias[b] @ (turn - self.spins[b]) / self.dt**2
+        d.soft[system.fixed] = 0.0
         return energy
+
+    def hessian(self, state: State, *, projected: bool = False) -> None:
+        """Fill the Hessian in the system's derivatives, the identity where held."""
+        system, d, dt = self.system, self.system.derivatives, self.dt
+        d.clear_hessian()
+        system.add_hessian(state, projected=projected)
+        add_diagonal(system.pattern.indptr, system.pattern.indices, system.masses / dt**2, d.blocks)
+        for b, turn in enumerate(self._turns(state)):
+            jacobian = inverse_left_jacobian(turn)
+            body = slice(6 * b, 6 * b + 6)
+            d.rigid_matrix[body, body][:3, :3] += np.eye(3) * system.rigid_masses[b] / dt**2
+            d.rigid_matrix[body, body][3:, 3:] += jacobian.T @ self.inertias[b] @ jacobian / dt**2
+        system.hold_fixed()
 
     def finished(self, trial: State) -> State:
         """Return ``trial`` as the end of the step, with its velocities."""

@@ -31,14 +31,16 @@ class Derivatives:
     coupling: np.ndarray
     rigid_matrix: np.ndarray
 
-    def clear(self, *, hessian: bool) -> None:
-        """Set everything that will be added to, to zero."""
+    def clear_gradient(self) -> None:
+        """Set the gradient to zero."""
         self.soft[:] = 0.0
         self.rigid[:] = 0.0
-        if hessian:
-            self.blocks[:] = 0.0
-            self.coupling[:] = 0.0
-            self.rigid_matrix[:] = 0.0
+
+    def clear_hessian(self) -> None:
+        """Set the Hessian to zero."""
+        self.blocks[:] = 0.0
+        self.coupling[:] = 0.0
+        self.rigid_matrix[:] = 0.0
 
 
 class System:
@@ -130,24 +132,26 @@ class System:
         dead = np.vdot(self.forces, state.positions) + np.vdot(self.rigid_forces, state.rigid_positions)
         return self.elastic_energy(state.positions) + self.contact.energy(state) - dead
 
-    def derive(self, state: State, *, hessian: bool, projected: bool = False) -> float:
-        """Fill `derivatives` with gradient (and Hessian) of `energy`, and return that energy [J]."""
+    def add_gradient(self, state: State) -> float:
+        """Add the gradient of `energy` to `derivatives`, and return that energy [J]."""
         d = self.derivatives
-        d.clear(hessian=hessian)
-        energy = -np.vdot(self.forces, state.positions) - np.vdot(self.rigid_forces, state.rigid_positions)
         d.soft -= self.forces
         d.rigid[:, :3] -= self.rigid_forces
+        energy = -np.vdot(self.forces, state.positions) - np.vdot(self.rigid_forces, state.rigid_positions)
+        energy += sum(potential.add_gradient(state.positions, d.soft) for potential in self.potentials)
+        return energy + self.contact.add_gradient(state, d)
+
+    def add_hessian(self, state: State, *, projected: bool = False) -> None:
+        """Add the Hessian of `energy` to `derivatives`; ``projected``: a positive semidefinite one."""
+        d = self.derivatives
         for potential, slots in zip(self.potentials, self.slots, strict=True):
-            energy += potential.add_gradient(state.positions, d.soft)
-            if hessian:
-                potential.add_hessian(state.positions, slots, d.blocks, projected=projected)
-        return energy + self.contact.add_derivatives(state, d, hessian=hessian)
+            potential.add_hessian(state.positions, slots, d.blocks, projected=projected)
+        self.contact.add_hessian(state, d)
 
     def hold_fixed(self) -> None:
-        """Make held degrees of freedom drop out of the Hessian and the gradient."""
+        """Make held degrees of freedom drop out of the Hessian."""
         d = self.derivatives
         hold(self.pattern.indptr, self.pattern.indices, self.fixed, d.blocks, d.coupling)
-        d.soft[self.fixed] = 0.0
 
     def residual(self) -> tuple[float, str]:
         """Return the largest unbalanced force in `derivatives` [N] and what it acts on; a torque counts over the body's size."""

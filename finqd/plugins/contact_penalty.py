@@ -34,7 +34,7 @@ class Penalty:
     sample_spacing_mm: largest distance of the points on soft faces that feel contact
     friction_stiffness_ratio: tangential over normal stiffness
     step_allowance_mm: how far a point may move into a body in one Newton step
-    weight_penetration_mm: how far a rigid body sinks into the floor on one support point under its own weight
+    weight_penetration_mm: how far a rigid body sinks into the floor at most on one support point under its own weight
     """
 
     stiffness_N_mm3: Annotated[float, Gt(0), Le(1e6)] = 300.0
@@ -68,7 +68,10 @@ class PenaltyContact:
         self.feature_normals = [_outward(s) for s in shapes]
         # under weightless conditions a body still must not sink into a plane: 1 g stands in for gravity
         weight = max(float(np.linalg.norm(scene.gravity)), 9.81)
-        self.support_stiffness = [s.mass * weight / (options.weight_penetration_mm * MM) for s in shapes]
+        self.support_stiffness = [
+            max(s.mass * weight / (options.weight_penetration_mm * MM), stiffness * FEATURE_WIDTH * CORNER_LENGTH)
+            for s in shapes
+        ]
         self.boxes = [_box(shape) for shape in shapes]
         self._lay_out_keys()
         self.rows = Rows(self.n_keys, self.surface.faces.shape[1])
@@ -144,11 +147,19 @@ class PenaltyContact:
         slips = self._trial_slips(state)
         return energy + kernels.friction_energy(slips, friction.bound, friction.stiffness, len(slips))
 
-    def add_derivatives(self, state: State, derivatives: Derivatives, *, hessian: bool) -> float:
-        """Add gradient and positive semidefinite Hessian, return the energy [J]; friction at the lagged bounds."""
+    def add_gradient(self, state: State, derivatives: Derivatives) -> float:
+        """Add the gradient, return the energy [J]; friction at the lagged bounds."""
+        energy, slips = self._add(state, derivatives, gradient=True)
+        return energy + kernels.friction_energy(slips, self.friction.bound, self.friction.stiffness, len(slips))
+
+    def add_hessian(self, state: State, derivatives: Derivatives) -> None:
+        """Add the positive semidefinite Hessian: exact for friction, Gauss-Newton for the penalty."""
+        self._add(state, derivatives, gradient=False)
+
+    def _add(self, state: State, d: Derivatives, *, gradient: bool) -> tuple[float, np.ndarray]:
         self._find(state)
-        d, rows, f = derivatives, self.rows, self.friction
-        out = (d.soft, d.rigid, d.blocks, d.coupling, d.rigid_matrix, hessian)
+        rows, f = self.rows, self.friction
+        out = (d.soft, d.rigid, d.blocks, d.coupling, d.rigid_matrix, gradient, not gradient)
         energy = kernels.add_normal(
             self.surface.faces, self.face_slots, rows.face, rows.weight, rows.gap, rows.normal, rows.arm,
             rows.stiffness, rows.rigid, rows.count, self.options.smoothing_mm * MM, *out,
@@ -158,13 +169,17 @@ class PenaltyContact:
             self.surface.faces, self.face_slots, f.face, f.weight, slips, f.bound, f.stiffness, f.normal, f.start_arm,
             f.rigid, self._turn_jacobians(state), len(slips), *out,
         )
-        return energy + kernels.friction_energy(slips, f.bound, f.stiffness, len(slips))
+        return energy, slips
 
     def step_limit(self, state: State, direction: Direction) -> float:
         """Return the largest share (0, 1] of ``direction`` in which no point sinks too far into anything."""
         allowance, spacing = self.options.step_allowance_mm * MM, self.options.sample_spacing_mm * MM
         surface, limit = self.surface, 1.0
+        farthest = float(np.sqrt(np.max(np.sum(direction.soft**2, axis=1), initial=0.0)))
         for r, body in enumerate(self.scene.rigid_bodies):
+            move = np.linalg.norm(direction.rigid[r, :3]) + np.linalg.norm(direction.rigid[r, 3:]) * body.shape.bounding_radius
+            if farthest + move <= allowance:
+                continue
             limit = min(
                 limit,
                 kernels.soft_step_limit(
@@ -228,14 +243,16 @@ class PenaltyContact:
         if self.last_rows_state is state:
             return
         rows, surface, scene = self.rows, self.surface, self.scene
-        samples = (surface.faces, surface.face_corners, surface.sample_face, surface.sample_weight, self.sample_stiffness)
+        samples = (
+            surface.faces, surface.face_corners, surface.first_sample, surface.sample_weight, self.sample_stiffness
+        )
         rows.count = 0
         self._renew_pairs(state)
         for r, body in enumerate(scene.rigid_bodies):
             pose = (np.ascontiguousarray(state.rigid_positions[r]), np.ascontiguousarray(state.rigid_rotations[r]))
             rows.count = kernels.find_soft_rigid(
-                state.positions, *samples, *pose, body.shape.distance, *self.boxes[r], r, self.first_key["rigid", r],
-                *rows.arrays, rows.count,
+                state.positions, *samples, *pose, body.shape.distance, *self.boxes[r], float(body.shape.bounding_radius), r,
+                self.first_key["rigid", r], *rows.arrays, rows.count,
             )
             for b, pairs in enumerate(self._pairs[r]):
                 rows.count = kernels.find_feature_soft(

@@ -55,7 +55,7 @@ class ImplicitEuler:
 
     def _minimise(self, system: System, increment: EulerIncrement, trial: State, report: StepReport) -> State:
         """Run Newton's method from ``trial``; ``report`` says how it went."""
-        energy = increment.derive(trial, hessian=False)
+        energy = increment.gradient(trial)
         while True:
             report.residual, report.where = system.residual()
             report.residuals.append(report.residual)
@@ -69,7 +69,7 @@ class ImplicitEuler:
                 if system.contact.relag(trial) <= self.friction_tolerance:
                     break
                 report.friction_updates += 1
-                energy = increment.derive(trial, hessian=False)
+                energy = increment.gradient(trial)
                 continue
             if report.iterations >= self.max_iterations:
                 report.reason = (
@@ -77,18 +77,20 @@ class ImplicitEuler:
                 )
                 return trial
             report.iterations += 1
-            moved = self._iterate(system, increment, trial, report)
+            moved = self._iterate(system, increment, trial, energy, report)
             if moved is None:
                 return trial
             trial = moved
-            energy = increment.derive(trial, hessian=False)
+            energy = increment.gradient(trial)
         report.converged = True
         return trial
 
-    def _iterate(self, system: System, increment: EulerIncrement, trial: State, report: StepReport) -> State | None:
+    def _iterate(
+        self, system: System, increment: EulerIncrement, trial: State, energy: float, report: StepReport
+    ) -> State | None:
         """Do one Newton iteration; None if no direction leads downhill."""
         for projected in (False, True):
-            energy = increment.derive(trial, hessian=True, projected=projected)
+            increment.hessian(trial, projected=projected)
             solution = self._solve(system, report)
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
             d = system.derivatives
