@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -156,6 +159,39 @@ def test_a_full_disk_is_a_sentence(run, evaluated):
     evaluated.error = OSError(28, "No space left on device", "/some/file")
     code, _, err = run("evaluate", "benchmark", "--quiet")
     assert code == 2 and err.splitlines()[-1] == "finqd: /some/file: No space left on device"
+
+
+def living(group):
+    """Return the processes of a group that still run."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[2]) == group and fields[0] not in "ZX":
+            found.append(stat.parent.name)
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_ctrl_c_in_a_real_run_leaves_one_line_no_file_and_no_process(tmp_path):
+    program = [sys.executable, "-m", "finqd", "evaluate", "benchmark", "--jobs", "2", "--out", "result.json"]
+    with subprocess.Popen(
+        program, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        deadline = time.monotonic() + 60.0
+        while len(living(process.pid)) < 3 and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.1)  # until there are workers to be left behind
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    said = [line for line in err.splitlines() if line and "warning" not in line and "done" not in line]
+    assert (process.returncode, out, said) == (130, "", ["finqd: interrupted"])
+    assert not list(tmp_path.iterdir())
+    deadline = time.monotonic() + 10.0
+    while living(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not living(process.pid)
 
 
 @pytest.fixture
