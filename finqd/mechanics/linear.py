@@ -14,6 +14,7 @@ which show what those cost at this conditioning. Decisions depend on counts, nev
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -39,6 +40,8 @@ PRECONDITIONERS = ("factorisation", "block_jacobi", "jacobi")
 _DIRECT_TOLERANCE = 1e-6
 #: smallest eigenvalue of a scaled Schur complement, as a share of the largest, that is told from zero
 _SINGULAR = 1e-14
+#: iterations that a lagged inverse is always granted
+_FEWEST = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,7 +210,6 @@ def conjugate_gradients(
     preconditioner: Preconditioner,
     rhs: np.ndarray,
     *,
-    start: np.ndarray | None = None,
     tolerance: float,
     max_iterations: int,
 ) -> _Iterate:
@@ -217,15 +219,11 @@ def conjugate_gradients(
     the energy norm, which mixes no newtons with newton metres. Stops as well at a direction without positive curvature,
     before taking it: ``definite`` is then False.
     """
-    state = _Iterate(np.zeros(len(rhs)) if start is None else start.copy())
+    state = _Iterate(np.zeros(len(rhs)))
     residual = rhs.copy()
     preconditioned = preconditioner.apply(residual)
     size = dot(residual, preconditioned)
     target = tolerance * tolerance * size
-    if start is not None:
-        residual -= matrix.product(start)
-        preconditioned = preconditioner.apply(residual)
-        size = dot(residual, preconditioned)
     direction = preconditioned.copy()
     while size > target and state.iterations < max_iterations:
         product = matrix.product(direction)
@@ -258,15 +256,16 @@ class LinearSolver:
         backend: str,
         tolerance: float,
         max_iterations: int,
-        refactor_after: int,
+        refactor_cost: float | None,
     ) -> None:
         self.pattern = pattern
         self.method, self.preconditioner = method, preconditioner
-        self.tolerance, self.max_iterations, self.refactor_after = tolerance, max_iterations, refactor_after
+        self.tolerance, self.max_iterations, self.refactor_cost = tolerance, max_iterations, refactor_cost
         self._factorisation: Factorisation | None = None
         if method == "direct" or preconditioner == "factorisation":
             self._factorisation = create_factorisation(backend, pattern)
         self._lagged: CoupledInverse | None = None
+        self._refactor_cost, self._spent, self._solved = 0.0, 0, 0  # since the lagged inverse was made, in iterations
 
     def solve(
         self,
@@ -330,35 +329,47 @@ class LinearSolver:
         return _solve_directly(matrix, inverse, rhs), True
 
     def _lagged_cg(self, matrix: CoupledMatrix, rhs: np.ndarray, tolerance: float) -> tuple[_Iterate, bool]:
-        """Iterate with the inverse of an earlier matrix; once that has cost as much as a new one, make a new one.
+        """Iterate with the inverse of an earlier matrix; make a new one when that is cheaper in the long run.
 
-        It is made for the next system, or at once, from where the iteration stands, after twice as many iterations.
+        A lagged inverse serves worse and worse. It is best replaced when the next system would cost more than the
+        average since it was made, its own cost included (the replacement problem: Barlow and Hunter 1960, minimal
+        repair); at once, if one system alone has cost as much as a new inverse.
         """
         state = _Iterate(np.zeros(len(rhs)))
         if self._lagged is not None and self._lagged.fits(matrix):
-            state = conjugate_gradients(
-                matrix, self._lagged, rhs, tolerance=tolerance, max_iterations=2 * self.refactor_after
-            )
-            if not state.definite or state.iterations > self.refactor_after:
+            limit = max(_FEWEST, math.ceil(self._refactor_cost))
+            state = conjugate_gradients(matrix, self._lagged, rhs, tolerance=tolerance, max_iterations=limit)
+            self._spent += state.iterations
+            self._solved += 1
+            if not state.definite or state.iterations * self._solved > self._refactor_cost + self._spent:
                 self._lagged = None
             if not state.definite or state.converged:
                 return state, False
         assert self._factorisation is not None
-        self._lagged = None
+        self._lagged, wasted = None, state.iterations
         try:
             inverse = CoupledInverse(self._factorisation, matrix)
         except np.linalg.LinAlgError:
             state.definite = False
             return state, True
-        if not inverse.positive:
-            return _solve_directly(matrix, inverse, rhs), True
-        self._lagged = inverse
-        start, spent = (state.x, state.iterations) if state.iterations else (None, 0)
-        state = conjugate_gradients(
-            matrix, inverse, rhs, start=start, tolerance=tolerance, max_iterations=self.max_iterations
-        )
-        state.iterations += spent
+        state = _solve_directly(matrix, inverse, rhs)
+        if inverse.positive:
+            self._lagged, self._spent, self._solved = inverse, 1, 1
+            self._refactor_cost = self._cost_of(matrix)
+            if not state.converged:
+                state = conjugate_gradients(
+                    matrix, inverse, rhs, tolerance=tolerance, max_iterations=self.max_iterations
+                )
+        state.iterations += wasted
         return state, True
+
+    def _cost_of(self, matrix: CoupledMatrix) -> float:
+        """Return what a new inverse costs, in iterations."""
+        if self.refactor_cost is not None:
+            return self.refactor_cost
+        assert self._factorisation is not None
+        column = self._factorisation.factor_entries / max(len(matrix.coupling), 1)
+        return self._factorisation.factor_cost * column + self._factorisation.column_cost * len(matrix.rigid)
 
 
 def _solve_directly(matrix: CoupledMatrix, inverse: CoupledInverse, rhs: np.ndarray) -> _Iterate:
@@ -380,14 +391,14 @@ def make_solver(
     backend: str = "auto",
     tolerance: float = 1e-6,
     max_iterations: int = 10_000,
-    refactor_after: int = 8,
+    refactor_cost: float | None = None,
 ) -> LinearSolver:
     """Return a solver for systems whose soft matrix has the sparsity ``pattern``.
 
     method: "cg" or "direct"; preconditioner (of cg): "factorisation", "block_jacobi" or "jacobi"
     backend: library of the factorisation, "auto" for the fastest that is installed (see `linear_backends`)
     tolerance: see `conjugate_gradients`; max_iterations: of one solve
-    refactor_after: iterations with a lagged preconditioner after which the next system gets a new one
+    refactor_cost: what a new lagged inverse costs, in iterations of CG; None for what the backend is known to take
     Raises InputError for an unknown method, preconditioner or backend.
     """
     for what, value, known in (("method", method, METHODS), ("preconditioner", preconditioner, PRECONDITIONERS)):
@@ -400,5 +411,5 @@ def make_solver(
         backend=backend,
         tolerance=tolerance,
         max_iterations=max_iterations,
-        refactor_after=refactor_after,
+        refactor_cost=refactor_cost,
     )

@@ -20,7 +20,7 @@ import importlib.util
 import sys
 import weakref
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -36,7 +36,11 @@ BACKENDS = ("pardiso", "cholmod", "qdldl", "superlu")
 class Factorisation(Protocol):
     """A sparse factorisation of a symmetric matrix whose sparsity stays."""
 
-    #: non-zeros of the triangular factor, after the first `factorise`; 0 where the library does not tell
+    #: what a factorisation costs for each entry in a mean column of L, and a right-hand side more, in iterations of CG:
+    #: measured by benchmarks/linear_solvers.py, written down so that decisions never hang on a clock
+    factor_cost: ClassVar[float]
+    column_cost: ClassVar[float]
+    #: non-zeros of the triangular factor, after the first `factorise`
     factor_entries: int
 
     def factorise(self, blocks: np.ndarray) -> bool:
@@ -115,6 +119,9 @@ class Rows:
 class QdldlFactorisation:
     """L D L^T of the library QDLDL (Apache licence), with approximate minimum degree ordering."""
 
+    factor_cost: ClassVar[float] = 0.23
+    column_cost: ClassVar[float] = 0.7
+
     def __init__(self, pattern: BlockPattern) -> None:
         self._rows = Rows(pattern, "lower")
         self._solver: Any = None
@@ -153,6 +160,9 @@ class QdldlFactorisation:
 class SuperluFactorisation:
     """L U of SciPy's SuperLU in symmetric mode: the slowest, but always there."""
 
+    factor_cost: ClassVar[float] = 0.5
+    column_cost: ClassVar[float] = 0.4
+
     def __init__(self, pattern: BlockPattern) -> None:
         self._rows = Rows(pattern, "full")
         self._factors: Any = None
@@ -184,6 +194,9 @@ class SuperluFactorisation:
 class CholmodFactorisation:
     """Supernodal Cholesky of SuiteSparse through scikit-sparse 0.4; stops at an indefinite matrix."""
 
+    factor_cost: ClassVar[float] = 0.1
+    column_cost: ClassVar[float] = 0.3
+
     def __init__(self, pattern: BlockPattern) -> None:
         self._rows = Rows(pattern, "full")
         self._factor: Any = None
@@ -211,6 +224,9 @@ class CholmodFactorisation:
 
 class PardisoFactorisation:
     """MKL's Pardiso: supernodal Cholesky, and Bunch-Kaufman L D L^T where the matrix turns out to be indefinite."""
+
+    factor_cost: ClassVar[float] = 0.05
+    column_cost: ClassVar[float] = 0.25
 
     def __init__(self, pattern: BlockPattern) -> None:
         self._rows = Rows(pattern, "upper")
