@@ -16,6 +16,7 @@ from finqd.solid import Patch, Prism, Solid
 from finqd.units import MM
 
 _GOOD_ENOUGH = 0.1  # sine of the worst corner above which no second mesh is tried
+_AREA = 1e-9  # relative difference that rounding may leave
 _LAYER = 1.25  # layers are that much longer than the size: bending leaves the thickness almost straight
 _CORNER = np.radians(150.0)  # a profile's corner below this angle is a corner of its patch
 
@@ -46,18 +47,26 @@ class Swept:
 
     def _plane(self, solid: Prism) -> PlaneMesh:
         patches = solid.patches or _single_patch(solid)
-        first = None
-        if patches:
-            try:
-                first = mesh_patches(patches, self.size_mm * MM, self.least_edges)
-            except MeshError:
-                first = None  # the second way may still do
-            if first and first.worst() >= _GOOD_ENOUGH:
-                return first
+        first = self._from_patches(solid, patches) if patches else None
+        if first and first.worst() >= _GOOD_ENOUGH:
+            return first
         from finqd.plugins.swept_paving import pave
 
-        second = pave(solid, self.size_mm * MM, self.least_edges)
+        try:
+            second = pave(solid, self.size_mm * MM, self.least_edges)
+        except MeshError:
+            if first is None:
+                raise
+            return first
         return first if first and first.worst() >= second.worst() else second
+
+    def _from_patches(self, solid: Prism, patches: tuple[Patch, ...]) -> PlaneMesh | None:
+        """Return the mesh of the patches, or None if they are no partition of the profile or do not fit together."""
+        try:
+            plane = mesh_patches(patches, self.size_mm * MM, self.least_edges)
+        except MeshError:
+            return None
+        return plane if plane.worst() > 0 and abs(plane.area() - solid.area) <= _AREA * solid.area else None
 
     def _sweep(self, plane: PlaneMesh, thickness: float) -> Mesh:
         layers = self.layers or max(2, int(thickness / (_LAYER * self.size_mm * MM)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from finqd.errors import MeshError
-from finqd.solid import Patch
+from finqd.solid import Patch, ring_area
 
 _SAME_POINT = 1e-9  # [m]
 
@@ -25,6 +25,10 @@ class PlaneMesh:
     points: np.ndarray
     quads: np.ndarray
     triangles: np.ndarray
+
+    def area(self) -> float:
+        """Return the area [m^2]."""
+        return sum(abs(ring_area(self.points[corners])) for kind in (self.quads, self.triangles) for corners in kind)
 
     def worst(self) -> float:
         """Return the smallest sine of an element's corner angle, negative if it is turned over."""
@@ -156,38 +160,26 @@ class _Builder:
         return np.concatenate(nodes)
 
     def _grid(self, bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndarray) -> None:
-        """Fill a four-sided patch, its sides' node ids in counter-clockwise order (discrete Coons patch)."""
-        top, left = top[::-1], left[::-1]
-        columns, rows = len(bottom), len(left)
+        """Fill a four-sided patch, its sides' node ids in counter-clockwise order."""
         points = self._all()
-        u = np.linspace(0.0, 1.0, columns)[None, :, None]
-        v = np.linspace(0.0, 1.0, rows)[:, None, None]
-        surface = (1 - v) * points[bottom][None] + v * points[top][None]
-        surface = surface + (1 - u) * points[left][:, None] + u * points[right][:, None]
-        b0, b1, t0, t1 = points[bottom[0]], points[bottom[-1]], points[top[0]], points[top[-1]]
-        surface = surface - (1 - u) * (1 - v) * b0 - u * (1 - v) * b1 - (1 - u) * v * t0 - u * v * t1
-        ids = np.empty((rows, columns), dtype=int)
-        ids[0], ids[-1], ids[:, 0], ids[:, -1] = bottom, top, left, right
-        ids[1:-1, 1:-1] = self._add(surface[1:-1, 1:-1].reshape(-1, 2)).reshape(rows - 2, columns - 2)
-        self.quads.append(np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4))
+        inner = _coons(*(points[side] for side in (bottom, right, top, left)))[1:-1, 1:-1]
+        ids = np.empty((len(right), len(bottom)), dtype=int)
+        ids[0], ids[-1], ids[:, 0], ids[:, -1] = bottom, top[::-1], left[::-1], right
+        ids[1:-1, 1:-1] = self._add(inner.reshape(-1, 2)).reshape(inner.shape[:2])
+        self.quads.append(_cells(ids).reshape(-1, 4))
 
     def _triangle(self, *sides: np.ndarray) -> None:
         """Fill a three-sided patch by three grids that meet in a point inside it."""
-        counts = np.array([len(side) - 1 for side in sides])
-        first = [int(counts[i] + counts[(i + 1) % 3] - counts[(i + 2) % 3]) // 2 for i in range(3)]
-        # side i is split after first[i] edges; the middle nodes and the centre bound the three grids
-        middle = [side[k] for side, k in zip(sides, first, strict=True)]
         points = self._all()
-        centre = self._add(_centre(points[[side[0] for side in sides]], points[middle])[None])[0]
-        spokes = []
+        first, spokes = _halves([len(side) - 1 for side in sides])
+        centre = _centre([points[side] for side in sides], first, spokes)
+        hub = self._add(centre[None])
+        arms = []
+        for side, k, edges in zip(sides, first, spokes, strict=True):
+            inner = self._add(_between(points[side[k]], centre, edges)[1:-1])
+            arms.append(np.concatenate([side[k : k + 1], inner, hub]))
         for i in range(3):
-            edges = counts[i - 1] - first[i - 1]
-            share = np.arange(1, edges)[:, None] / edges
-            inner = self._add(points[middle[i]] + share * (self._all()[centre] - points[middle[i]]))
-            spokes.append(np.concatenate([[middle[i]], inner, [centre]]))
-        for i in range(3):
-            start, end = sides[i][: first[i] + 1], sides[i - 1][first[i - 1] :]
-            self._grid(start, spokes[i], spokes[i - 1][::-1], end)
+            self._grid(sides[i][: first[i] + 1], arms[i], arms[i - 1][::-1], sides[i - 1][first[i - 1] :])
 
     def _all(self) -> np.ndarray:
         if len(self.points) > 1:
@@ -195,13 +187,47 @@ class _Builder:
         return self.points[0]
 
 
-def _centre(corners: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Return the point in a triangle whose three grids have the best worst corner; ``middle`` (3, 2): on its sides."""
-    steps = np.array([(i, j, 20 - i - j) for i in range(1, 19) for j in range(1, 20 - i)]) / 20.0
-    tried = steps @ corners
-    worst = np.full(len(tried), np.inf)
+def _between(start: np.ndarray, end: np.ndarray, edges: int) -> np.ndarray:
+    """Return edges + 1 points evenly from ``start`` (2,) to ``end`` (..., 2), shape (..., edges + 1, 2)."""
+    return start + np.linspace(0.0, 1.0, edges + 1)[:, None] * (end[..., None, :] - start)
+
+
+def _coons(bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Return the points (..., rows, columns, 2) between four sides, counter-clockwise (discrete Coons patch)."""
+    top, left = top[..., ::-1, :], left[..., ::-1, :]
+    u = np.linspace(0.0, 1.0, bottom.shape[-2])[None, :, None]
+    v = np.linspace(0.0, 1.0, left.shape[-2])[:, None, None]
+    ruled = (1 - v) * bottom[..., None, :, :] + v * top[..., None, :, :]
+    ruled = ruled + (1 - u) * left[..., :, None, :] + u * right[..., :, None, :]
+    for side, end, weight in ((bottom, 0, 1 - u), (bottom, -1, u)):
+        ruled = ruled - weight * (1 - v) * side[..., end, :][..., None, None, :]
+    for side, end, weight in ((top, 0, 1 - u), (top, -1, u)):
+        ruled = ruled - weight * v * side[..., end, :][..., None, None, :]
+    return ruled
+
+
+def _cells(grid: np.ndarray) -> np.ndarray:
+    """Return the corners of the cells of a grid (rows, columns, ...), (rows - 1, columns - 1, 4, ...)."""
+    return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2)
+
+
+def _halves(counts: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return how many edges of each side of a triangle lie before its middle node, and edges from there to the hub."""
+    first = [(counts[i] + counts[(i + 1) % 3] - counts[(i + 2) % 3]) // 2 for i in range(3)]
+    return first, [counts[i - 1] - first[i - 1] for i in range(3)]
+
+
+def _centre(sides: Sequence[np.ndarray], first: Sequence[int], spokes: Sequence[int]) -> np.ndarray:
+    """Return where the three grids of a triangle should meet: the best worst corner among many points tried."""
+    corners = np.array([side[0] for side in sides])
+    middle = np.array([side[k] for side, k in zip(sides, first, strict=True)])
+    shares = np.array([(i, j, 16 - i - j) for i in range(1, 15) for j in range(1, 16 - i)]) / 16.0
+    parts = [corners, middle, *(np.array([corners[i], middle[i], middle[i - 1]]) for i in range(3))]
+    hubs = np.concatenate([shares @ part for part in parts])
+    arms = [_between(side[k], hubs, edges) for side, k, edges in zip(sides, first, spokes, strict=True)]
+    worst = np.full(len(hubs), np.inf)
     for i in range(3):
-        fixed = np.broadcast_to(np.array([corners[i], middle[i], corners[i], middle[i - 1]]), (len(tried), 4, 2)).copy()
-        fixed[:, 2] = tried
-        worst = np.minimum(worst, corner_sines(fixed).min(axis=1))
-    return tried[int(np.argmax(worst))]
+        start, end = sides[i][: first[i] + 1], sides[i - 1][first[i - 1] :]
+        grid = _coons(start, arms[i], arms[i - 1][:, ::-1], end)
+        worst = np.minimum(worst, corner_sines(_cells(np.moveaxis(grid, 0, 2)).swapaxes(2, 3)).min(axis=(0, 1, 3)))
+    return hubs[int(np.argmax(worst))]

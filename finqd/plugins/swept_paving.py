@@ -9,8 +9,10 @@ from finqd.gmsh_session import gmsh_session
 from finqd.plugins.swept_patches import PlaneMesh
 from finqd.solid import Prism, ring_area
 
-#: gmsh's 2-D algorithm and recombination algorithm, in the order in which they are tried
-_WAYS = ((8, 1), (6, 1), (8, 2), (5, 3))
+#: gmsh's 2-D algorithm and recombination algorithm (0: triangles stay), in the order in which they are tried
+_WAYS = ((8, 1), (6, 1), (8, 2), (5, 3), (6, 0))
+_POOR = 0.02  # sine of the worst corner
+_AREA = 1e-9  # relative difference that rounding may leave
 
 
 def pave(solid: Prism, size: float, least: int) -> PlaneMesh:
@@ -21,8 +23,12 @@ def pave(solid: Prism, size: float, least: int) -> PlaneMesh:
     best: PlaneMesh | None = None
     reason = ""
     for algorithm, recombination in _WAYS:
+        if recombination == 0 and best is not None and best.worst() > _POOR:
+            break  # poor quadrilaterals bend better than good wedges
         try:
             plane = _attempt(solid, size / least, algorithm, recombination)
+            if abs(plane.area() - solid.area) > _AREA * solid.area:
+                raise MeshError("elements overlap")
         except MeshError as error:
             reason = str(error)
             continue
@@ -39,7 +45,6 @@ def _attempt(solid: Prism, size: float, algorithm: int, recombination: int) -> P
     outer = solid.outer if ring_area(solid.outer) > 0 else solid.outer[::-1]
     with gmsh_session() as gmsh:
         gmsh.option.setNumber("Mesh.Algorithm", algorithm)
-        gmsh.option.setNumber("Mesh.RecombinationAlgorithm", recombination)
         geo, loops = gmsh.model.geo, []
         for ring in (outer, *solid.holes):
             ids = [geo.addPoint(x, y, 0.0, size) for x, y in np.asarray(ring)]
@@ -49,7 +54,9 @@ def _attempt(solid: Prism, size: float, algorithm: int, recombination: int) -> P
                 geo.mesh.setTransfiniteCurve(line, max(1, round(length / size)) + 1)
             loops.append(geo.addCurveLoop(lines))
         surface = geo.addPlaneSurface(loops)
-        geo.mesh.setRecombine(2, surface)
+        if recombination:
+            gmsh.option.setNumber("Mesh.RecombinationAlgorithm", recombination)
+            geo.mesh.setRecombine(2, surface)
         geo.synchronize()
         try:
             gmsh.model.mesh.generate(2)
