@@ -73,7 +73,8 @@ def _numbered(patches: Sequence[Patch]) -> tuple[np.ndarray, list[list[list[int]
     links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(flat), len(flat)))
     count, ids = connected_components(links, directed=False)
     _, first = np.unique(ids, return_index=True)
-    sides, start = [], 0
+    sides: list[list[list[int]]] = []
+    start = 0
     for patch in patches:
         sides.append([])
         for side in patch:
@@ -91,7 +92,10 @@ def edge_counts(rims: Sequence[Sequence[Sequence[int]]], wanted: np.ndarray, lea
     from scipy.sparse import coo_array
 
     n = len(wanted)
-    rows, columns, values, n_rows, n_columns = [], [], [], 0, 2 * n
+    rows: list[int] = []
+    columns: list[int] = []
+    values: list[float] = []
+    n_rows, n_columns = 0, 2 * n
 
     def equation(*terms: tuple[Sequence[int], float]) -> None:
         nonlocal n_rows
