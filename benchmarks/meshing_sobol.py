@@ -1,6 +1,6 @@
 """Meshes fin rays over the whole search space with both meshers, in the process that can be killed.
 
-    python benchmarks/meshing_sobol.py [--designs 500] [--swept-mm 4] [--tetrahedral-mm 2] [--order 1] [--log FILE]
+    python benchmarks/meshing_sobol.py [--designs 500] [--swept-mm 4] [--tetrahedral-mm 4] [--order 1] [--log FILE]
 
 Every finger of every design. Rows go to the log as they come; started again, the script goes on where it stopped, and
 with a finished log it just prints the table: quality, wedges, volume, dofs, seconds. Exits with 1 if any finger fails:
@@ -101,7 +101,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--designs", type=int, default=500)
     parser.add_argument("--swept-mm", type=float, default=4.0)
-    parser.add_argument("--tetrahedral-mm", type=float, default=2.0)
+    parser.add_argument("--tetrahedral-mm", type=float, default=4.0)
     parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--time-limit-s", type=float, default=60.0)
