@@ -396,7 +396,7 @@ def make_solver(
     """Return a solver for systems whose soft matrix has the sparsity ``pattern``.
 
     method: "cg" or "direct"; preconditioner (of cg): "factorisation", "block_jacobi" or "jacobi"
-    backend: library of the factorisation, "auto" for the fastest that is installed (see `linear_backends`)
+    backend: library of the factorisation, "auto" for the first that is installed of `linear_backends.BACKENDS`
     tolerance: see `conjugate_gradients`; max_iterations: of one solve
     refactor_cost: what a new lagged inverse costs, in iterations of CG; None for what the backend is known to take
     Raises InputError for an unknown method, preconditioner or backend.
