@@ -2,9 +2,9 @@
 
     python benchmarks/linear_solvers.py [--object sphere] [--until 1.0] [--repeat 7]
 
-First table: one factorisation, triangular solves and a product, by backend. Second table: all systems of successive time
-steps, one after the other, by method; "per system" includes everything. Milliseconds of processor time, the fastest of
-the repeats; one thread.
+First table: one factorisation, triangular solves and a product, by backend. Second table: all systems of successive
+time steps, one after the other, by method; "per system" includes everything. Milliseconds of processor time, the
+fastest of the repeats; one thread.
 """
 
 from __future__ import annotations
@@ -93,9 +93,8 @@ def backend_table(pattern: BlockPattern, system: Newton, repeat: int) -> None:
         first = fastest(lambda f=factorisation: f.factorise(system.blocks), 1)
         again = fastest(lambda f=factorisation: f.factorise(system.blocks), repeat)
         solves = [fastest(lambda f=factorisation, b=b: f.solve(b), repeat) for b in (one, seven)]
-        print(
-            f"| {name} | {first:.1f} | {again:.1f} | {solves[0]:.2f} | {solves[1]:.2f} | {factorisation.factor_entries} |"
-        )
+        entries = factorisation.factor_entries
+        print(f"| {name} | {first:.1f} | {again:.1f} | {solves[0]:.2f} | {solves[1]:.2f} | {entries} |")
 
 
 def method_table(pattern: BlockPattern, systems: list[Newton], repeat: int) -> None:
