@@ -68,14 +68,17 @@ def _soft_mesh(trajectory: Trajectory, meshes: Sequence[Mesh], frame: int) -> An
     for body, mesh in enumerate(meshes):
         for kind, nodes in mesh.blocks.items():
             order = _VTK_ORDER.get(kind, slice(None))
-            cells.append((_CELLS[kind], first + nodes[:, order]))
-            bodies.append(np.full(len(nodes), body))
+            cells.append((_CELLS[kind], (first + nodes[:, order]).astype(np.int32)))
+            bodies.append(np.full(len(nodes), body, dtype=np.int32))
         first += mesh.n_vertices
     rest = np.concatenate([mesh.vertices for mesh in meshes])
     return meshio.Mesh(
         positions[frame],
         cells,
-        point_data={"displacement": positions[frame] - rest, "velocity": velocity},
+        point_data={
+            "displacement": (positions[frame] - rest).astype(np.float32),
+            "velocity": velocity.astype(np.float32),
+        },
         cell_data={"body": bodies},
     )
 
@@ -87,8 +90,8 @@ def _rigid_mesh(trajectory: Trajectory, surfaces: Sequence[Surface], time: float
         return None
     vertices = trajectory.placed(surfaces, time)
     starts = np.cumsum([0, *(len(points) for points in vertices[:-1])])
-    cells = [("triangle", start + triangles) for start, (_, triangles) in zip(starts, surfaces)]
-    bodies = [np.full(len(triangles), body) for body, (_, triangles) in enumerate(surfaces)]
+    cells = [("triangle", (start + triangles).astype(np.int32)) for start, (_, triangles) in zip(starts, surfaces)]
+    bodies = [np.full(len(triangles), body, dtype=np.int32) for body, (_, triangles) in enumerate(surfaces)]
     return meshio.Mesh(np.concatenate(vertices), cells, cell_data={"body": bodies})
 
 

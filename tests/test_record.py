@@ -64,7 +64,7 @@ def test_soft_bodies_come_back_with_all_element_types(tmp_path):
     for frame, name in enumerate(names):
         back = meshio.read(tmp_path / name)
         np.testing.assert_array_equal(back.points, trajectory.soft_positions[frame])
-        np.testing.assert_allclose(back.point_data["displacement"], back.points - rest, atol=1e-16)
+        np.testing.assert_allclose(back.point_data["displacement"], back.points - rest, rtol=1e-6, atol=1e-10)
         assert [block.type for block in back.cells] == ["hexahedron", "wedge", "tetra", "tetra10", "hexahedron20"]
         assert [set(body) for body in back.cell_data["body"]] == [{0}, {1}, {2}, {3}, {4}]
         first = np.cumsum([0, *(mesh.n_vertices for mesh in meshes)])
@@ -73,7 +73,7 @@ def test_soft_bodies_come_back_with_all_element_types(tmp_path):
             np.testing.assert_array_equal(np.sort(block.data, axis=1), np.sort(nodes + start, axis=1))
     speed = back.point_data["velocity"]
     expected = (trajectory.soft_positions[2] - trajectory.soft_positions[1]) / 0.1
-    np.testing.assert_allclose(speed, expected, atol=1e-14)
+    np.testing.assert_allclose(speed, expected, rtol=1e-6, atol=1e-9)
     assert np.abs(speed).max() > 1e-3
 
 
