@@ -344,9 +344,24 @@ def _die_with_parent() -> None:
     threading.Thread(target=watch, name="finqd-parent-watch", daemon=True).start()
 
 
-def _interrupts_blocked() -> Any:
-    """Hold SIGINT back for a while; a process started inside never gets it, not even while its imports run."""
-    return _sigint_masked() if hasattr(signal, "pthread_sigmask") else nullcontext()
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Hold SIGINT back for a while; a process started inside never gets it, not even while its imports run.
+
+    Masking it in this thread is for the children, which inherit the mask. Another thread of this process may still take
+    the signal, and Python then calls its handler in the main thread, so the handler waits too.
+    """
+    came: list[int] = []
+    here = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, lambda number, frame: came.append(number)) if here else None
+    try:
+        with _sigint_masked() if hasattr(signal, "pthread_sigmask") else nullcontext():
+            yield
+    finally:
+        if here:
+            signal.signal(signal.SIGINT, handler)
+    if came and callable(handler):
+        handler(came[0], None)
 
 
 @contextmanager
