@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
-
-import numpy as np
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from finqd.design import Design
     from finqd.mechanics.material import Material
     from finqd.mechanics.pattern import BlockPattern
@@ -83,7 +83,7 @@ class Mesher(Protocol):
     """Turns a solid into a volume mesh. Runs in a process of its own, which can be killed."""
 
     def mesh(self, solid: Solid) -> Mesh:
-        """Return the mesh of ``solid``, with node set ``base`` and face set ``contact`` filled. Raises ``MeshError``."""
+        """Return the mesh of ``solid``, with node set ``base`` and face set ``contact``. Raises ``MeshError``."""
 
 
 class ElasticPotential(Protocol):
@@ -93,7 +93,7 @@ class ElasticPotential(Protocol):
     cliques: tuple[np.ndarray, ...]
 
     def energy(self, positions: np.ndarray) -> float:
-        """Return the elastic energy [J]; ``positions`` [m], shape (n_vertices, 3). May be inf for an inverted element."""
+        """Return the elastic energy [J]; ``positions`` [m], (n_vertices, 3). May be inf for an inverted element."""
 
     def add_gradient(self, positions: np.ndarray, gradient: np.ndarray) -> float:
         """Add dE/dpositions [N] to ``gradient``, shape (n_vertices, 3), and return the energy [J]."""
@@ -104,8 +104,8 @@ class ElasticPotential(Protocol):
         """Add the Hessian [N/m] to ``blocks``, shape (n_blocks, 3, 3).
 
         ``slots[b][e, i, j]`` is the index into ``blocks`` of the pair (node i, node j) of element e of block b
-        (see `finqd.mechanics.pattern`). ``projected``: each element's matrix is made positive semidefinite; otherwise it
-        is the exact second derivative.
+        (see `finqd.mechanics.pattern`). ``projected``: each element's matrix is made positive semidefinite; otherwise
+        it is the exact second derivative.
         """
 
 
@@ -165,7 +165,7 @@ class Stepper(Protocol):
     """One step in time."""
 
     def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:
-        """Return the state ``dt`` [s] later and a report; a step that fails says so there and returns ``state`` itself."""
+        """Return the state ``dt`` [s] later and a report; a step that fails says so there and returns ``state``."""
 
 
 class Actuation(Protocol):

@@ -20,9 +20,9 @@ GMSH_DEBIAN_PACKAGES = "libglu1-mesa libgl1 libxcursor1 libxft2 libxinerama1 lib
 #: module -> distribution; each is needed, and each says so itself when it is first used
 LIBRARIES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "gmsh": "gmsh", "trimesh": "trimesh", "fcl": "python-fcl",
-    "networkx": "networkx", "rtree": "rtree", "ribs": "ribs", "qdldl": "qdldl", "shapely": "shapely",
+    "networkx": "networkx", "ribs": "ribs", "qdldl": "qdldl", "shapely": "shapely",
     "meshio": "meshio", "pydantic": "pydantic", "rich": "rich", "matplotlib": "matplotlib", "click": "click",
-    "pebble": "pebble", "annotated_types": "annotated-types", "threadpoolctl": "threadpoolctl",
+    "annotated_types": "annotated-types", "threadpoolctl": "threadpoolctl",
 }
 
 #: linear solvers: module -> (distribution, what it is, how to get it)

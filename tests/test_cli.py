@@ -181,12 +181,13 @@ def test_ctrl_c_in_a_real_run_leaves_one_line_no_file_and_no_process(tmp_path):
         program, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         deadline = time.monotonic() + 60.0
-        while len(living(process.pid)) < 3 and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.1)  # until there are workers to be left behind
+        while len(living(process.pid)) < 5 and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.1)  # until there are two workers, a mesher and Python's own helper to be left behind
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=60)
     said = [line for line in err.splitlines() if line and "warning" not in line and "done" not in line]
-    assert (process.returncode, out, said) == (130, "", ["finqd: interrupted"])
+    assert (out, said) == ("", ["finqd: interrupted"])
+    assert process.returncode in (130, -signal.SIGINT), "a shell shows either as 130"
     assert not list(tmp_path.iterdir())
     deadline = time.monotonic() + 10.0
     while living(process.pid) and time.monotonic() < deadline:

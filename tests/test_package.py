@@ -18,8 +18,8 @@ from finqd import data, registry
 ROOT = Path(__file__).resolve().parent.parent
 #: what costs time or may be missing: nothing of it may load before it is needed
 HEAVY = {
-    "gmsh", "matplotlib", "numba", "trimesh", "scipy", "fcl", "ribs", "meshio", "shapely", "pydantic", "rich", "pandas",
-    "qdldl", "pebble", "llvmlite",
+    "gmsh", "numpy", "matplotlib", "numba", "trimesh", "scipy", "fcl", "ribs", "meshio", "shapely", "pydantic", "rich",
+    "qdldl", "llvmlite",
 }
 
 
