@@ -1,6 +1,7 @@
 """Meshes fin rays over the whole search space with both meshers, in the process that can be killed.
 
-    python benchmarks/meshing_sobol.py [--designs 500] [--swept-mm 4] [--tetrahedral-mm 4] [--order 1] [--log FILE]
+    python benchmarks/meshing_sobol.py [--designs 500] [--swept-mm 4] [--tetrahedral-mm 4] [--order 1]
+                                       [--only swept] [--log FILE]
 
 Every finger of every design. Rows go to the log as they come; started again, the script goes on where it stopped, and
 with a finished log it just prints the table: quality, wedges, volume, dofs, seconds. Exits with 1 if any finger fails:
@@ -52,6 +53,7 @@ def run(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         f"tetrahedral {arguments.tetrahedral_mm:g} mm, order {arguments.order}":
             Tetrahedral(size_mm=arguments.tetrahedral_mm, order=arguments.order),
     }
+    meshers = {name: mesher for name, mesher in meshers.items() if name.startswith(arguments.only)}
     rows = [json.loads(line) for line in arguments.log.read_text().splitlines()] if arguments.log.exists() else []
     done = {(row["mesher"], row["finger"]) for row in rows}
     with arguments.log.open("a") as log:
@@ -102,6 +104,7 @@ def main() -> int:
     parser.add_argument("--designs", type=int, default=500)
     parser.add_argument("--swept-mm", type=float, default=4.0)
     parser.add_argument("--tetrahedral-mm", type=float, default=4.0)
+    parser.add_argument("--only", choices=("swept", "tetrahedral", ""), default="")
     parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--time-limit-s", type=float, default=60.0)

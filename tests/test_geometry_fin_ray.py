@@ -123,6 +123,20 @@ def test_walls_may_meet_below_the_tip_line(profile: str) -> None:
     assert solid.patches is not None
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("width", [-1e-5, -1e-7, 0.0, 1e-9, 1e-6, 4e-6, 6e-6, 1e-5, 1e-4])
+def test_walls_that_meet_at_the_tip_line(profile: str, width: float) -> None:
+    """The cavity is ``width`` [m] wide at the tip line; negative: the walls meet below it."""
+    slope = BENCHMARK["width"] / BENCHMARK["length"]
+    stretch = 2 * np.hypot(1, slope / 2) if profile == "isosceles" else 1 + np.hypot(1, slope)
+    wall = (slope * 20 * MM - width) / stretch
+    finger = BENCHMARK | {"tip_length": 20 * MM, "contact_wall": wall, "back_wall": wall, "rib_angle": -0.45}
+    solid = FinRay(profile=profile).build(finger)
+    assert_sound(solid, profile, finger)
+    assert solid.patches is not None
+    assert mesh_patches(solid.patches, 4 * MM, 1).worst() > 0.1
+
+
 @pytest.mark.parametrize("wall", ["contact_wall", "back_wall"])
 @pytest.mark.parametrize("edge", ["lower", "upper"])
 @pytest.mark.parametrize("miss", [0.0, 1e-12, 1e-9, 1e-7, 1e-6, 5e-6, 1e-5, 1e-4, 3e-4])

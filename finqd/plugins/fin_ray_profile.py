@@ -82,7 +82,12 @@ def cavity(shape: Shape) -> tuple[np.ndarray, tuple[int, ...]]:
         direction = (end - start) / np.linalg.norm(end - start)
         inward = np.array([-direction[1], direction[0]])
         points, labels = clip(points, labels, -inward, -float(inward @ start) - offset, label)
-    return clip(points, labels, np.array([0.0, 1.0]), shape.length - shape.tip_length, TIP)
+    cut, cut_labels = clip(points, labels, np.array([0.0, 1.0]), shape.length - shape.tip_length, TIP)
+    if TIP in cut_labels:
+        i = cut_labels.index(TIP)
+        if np.linalg.norm(cut[i] - cut[(i + 1) % len(cut)]) < SHORTEST_EDGE:
+            return points, labels  # the walls as good as meet at the tip line
+    return cut, cut_labels
 
 
 def clip(
