@@ -120,10 +120,12 @@ class ContactPotential(Protocol):
     """All contacts and frictions of a scene, with their history. Positions and poses are those of a `State`.
 
     soft_forces: normal force on each soft body at the last committed state [N], shape (n_soft,)
+    relagged_forces: the same at the state of the last `relag`
     penetration: largest at the last committed state [m]
     """
 
     soft_forces: np.ndarray
+    relagged_forces: np.ndarray
     penetration: float
 
     def bind(self, pattern: BlockPattern) -> None:
@@ -144,11 +146,14 @@ class ContactPotential(Protocol):
         Coulomb friction has no potential: its bounds are lagged, and at fixed bounds it is one.
         """
 
-    def add_hessian(self, state: State, derivatives: Derivatives) -> None:
-        """Add a positive semidefinite Hessian to ``derivatives``."""
+    def add_hessian(self, state: State, derivatives: Derivatives, *, projected: bool = False) -> None:
+        """Add the Hessian to ``derivatives``; ``projected``: a positive semidefinite one."""
 
     def step_limit(self, state: State, direction: Direction) -> float:
         """Return the largest share (0, 1] of ``direction`` in which no contact can tunnel through."""
+
+    def strain(self, state: State) -> float:
+        """Return how far what is lagged has been left behind at ``state``; above 1, the step has to be shorter."""
 
     def commit(self, state: State) -> None:
         """Accept ``state`` as the end of the step: return mapping of the elastic slip, forces, penetrations."""

@@ -3,7 +3,9 @@
 A *contact* is a row: a point of a soft face (``face``, shape weights ``weight``; face = -1 if no soft body takes
 part) against a rigid body (``rigid``; -1 if a fixed plane) with signed ``gap`` [m], unit ``normal`` from the rigid
 towards the soft side (from the plane's side away from the body for a body on a plane), ``arm`` = contact point minus
-centre of mass [m], and ``stiffness`` [N/m].
+centre of mass [m], and ``stiffness`` [N/m]. ``turns`` says what happens to the normal when the rigid body turns: 1, it
+turns along (it belongs to the rigid body's surface); -1, it stays, and the contact point turns about it; 0, neither
+matters (nothing rigid, or a ball on a plane). ``curve`` is the second derivative of the gap [1/m], shape (3, 3).
 
 Relative displacement of a contact: w = sum_a weight_a dx_a - dc - dphi x arm, so dgap = normal . w.
 """
@@ -13,9 +15,9 @@ import math
 import numpy as np
 from numba import njit
 
-from finqd.mechanics.distance_kernels import signed_distance
+from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, signed_distance
 
-OPPOSED = 0.1  # cosine: two surfaces push on each other only if they look at each other at least this much
+OPPOSED, FULLY_OPPOSED = 0.05, 0.35  # cosines between which two surfaces that look at each other come to push fully
 
 
 @njit(cache=True)
@@ -56,6 +58,40 @@ def face_point(positions, nodes, weight, point):
 
 
 @njit(cache=True)
+def distance_curvature(field, d, y, n0, n1, rotation, normal, out):
+    """Write the second derivative [1/m] of a body's distance at a point, in the world frame, shape (3, 3).
+
+    y: the point, body frame; n0, n1: gradient's x and y there; ``normal``: gradient in the world frame. A ball's is
+    (I - n n^T)/|y|; a solid of revolution's n_r/r e e^T with e along the circumference (its profile has straight
+    pieces); a polyhedron's is 0.
+    """
+    out[:] = 0.0
+    if field.kind == SPHERE:
+        r = d + field.radius
+        for i in range(3):
+            for j in range(3):
+                out[i, j] = ((1.0 if i == j else 0.0) - normal[i] * normal[j]) / r
+    elif field.kind == REVOLUTION:
+        r2 = y[0] * y[0] + y[1] * y[1]
+        if r2 > 1e-12:
+            e = (rotation[:, 1] * y[0] - rotation[:, 0] * y[1]) / math.sqrt(r2)
+            for i in range(3):
+                for j in range(3):
+                    out[i, j] = (n0 * y[0] + n1 * y[1]) / r2 * e[i] * e[j]
+
+
+@njit(cache=True)
+def opposition(cosine):
+    """Return the share of its stiffness with which a contact acts whose sides look at each other with ``cosine``.
+
+    0 below OPPOSED, 1 above FULLY_OPPOSED, the cubic 3 t^2 - 2 t^3 between. Where two edges cross, it switches off what
+    pushes from the wrong side; gradually, since Newton's method stalls at a jump. It is held fixed in derivatives.
+    """
+    t = min(max((cosine - OPPOSED) / (FULLY_OPPOSED - OPPOSED), 0.0), 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@njit(cache=True)
 def face_box(positions, nodes, low, high):
     """Write a box that holds all points of a face: its vertices' box, grown by an eighth for faces that bulge [m]."""
     for i in range(3):
@@ -72,26 +108,42 @@ def face_box(positions, nodes, low, high):
 
 
 @njit(cache=True)
-def face_normal(positions, nodes, corners, normal):
-    """Write the unit normal of a face with 3 or 4 corners."""
-    a, b = positions[nodes[1]] - positions[nodes[0]], positions[nodes[2]] - positions[nodes[0]]
-    if corners == 4:
-        a, b = positions[nodes[2]] - positions[nodes[0]], positions[nodes[3]] - positions[nodes[1]]
-    n = np.cross(a, b)
-    normal[:] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
+def face_normals(positions, faces, corners, normals):
+    """Write the unit normals of faces with 3 or 4 ``corners``, shape (n_faces, 3)."""
+    for f in range(faces.shape[0]):
+        nodes = faces[f]
+        a, b = positions[nodes[1]] - positions[nodes[0]], positions[nodes[2]] - positions[nodes[0]]
+        if corners[f] == 4:
+            a, b = positions[nodes[2]] - positions[nodes[0]], positions[nodes[3]] - positions[nodes[1]]
+        n = np.cross(a, b)
+        normals[f] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
+
+
+@njit(cache=True)
+def smooth_normals(normals, first_neighbour, neighbour, smooth):
+    """Write the mean unit normal of the faces that meet smoothly at each vertex of each face, shape (n_faces, k, 3)."""
+    k = smooth.shape[1]
+    for f in range(smooth.shape[0]):
+        for a in range(k):
+            n = np.zeros(3)
+            for i in range(first_neighbour[f * k + a], first_neighbour[f * k + a + 1]):
+                n += normals[neighbour[i]]
+            smooth[f, a] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
 
 
 @njit(cache=True)
 def find_soft_rigid(
-    positions, faces, face_corners, first_sample, sample_weight, sample_stiffness, centre, rotation, field, low, high,
-    radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+    positions, faces, normals, first_sample, sample_weight, sample_stiffness, centre, rotation, field, low, high,
+    radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
+    count,
 ):
     """Append the samples of soft faces that lie inside a rigid body; return the new count.
 
-    low, high: bounding box of the body in its own frame, shape (3,); radius: of its bounding ball [m]. A sample whose face does not look towards the
-    body's surface is left out: where two edges cross, its force would be that of the wrong side.
+    low, high: bounding box of the body in its own frame, shape (3,); radius: of its bounding ball [m]; normals: unit normals of the
+    faces, shape (n_faces, 3). A sample acts as far as its
+    face looks towards the body's surface (`opposition`).
     """
-    x, y, m, face_n = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    x, y, m = np.empty(3), np.empty(3), np.empty(3)
     face_low, face_high = np.empty(3), np.empty(3)
     for f in range(faces.shape[0]):
         face_box(positions, faces[f], face_low, face_high)
@@ -118,8 +170,8 @@ def find_soft_rigid(
                 continue
             for i in range(3):
                 m[i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
-            face_normal(positions, faces[f], face_corners[f], face_n)
-            if np.dot(m, face_n) > -OPPOSED:
+            share = opposition(-np.dot(m, normals[f]))
+            if share <= 0.0:
                 continue
             out_key[count] = first_key + s
             out_face[count] = f
@@ -128,19 +180,22 @@ def find_soft_rigid(
             for i in range(3):
                 out_normal[count, i] = m[i]
                 out_arm[count, i] = x[i] - centre[i]
-            out_stiffness[count] = sample_stiffness[s]
+            out_stiffness[count] = share * sample_stiffness[s]
             out_rigid[count] = rigid
+            out_turns[count] = 1
+            distance_curvature(field, d, y, n0, n1, rotation, m, out_curve[count])
             count += 1
     return count
 
 
 @njit(cache=True)
 def find_soft_plane(
-    positions, faces, face_corners, first_sample, sample_weight, sample_stiffness, point, normal, first_key,
-    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+    positions, faces, normals, first_sample, sample_weight, sample_stiffness, point, normal, first_key,
+    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
+    count,
 ):
     """Append the samples of soft faces below a plane, as `find_soft_rigid` does; return the new count."""
-    x, face_n, face_low, face_high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    x, face_low, face_high = np.empty(3), np.empty(3), np.empty(3)
     for f in range(faces.shape[0]):
         face_box(positions, faces[f], face_low, face_high)
         lowest = 0.0
@@ -155,8 +210,8 @@ def find_soft_plane(
                 d += normal[i] * (x[i] - point[i])
             if d >= 0.0:
                 continue
-            face_normal(positions, faces[f], face_corners[f], face_n)
-            if np.dot(normal, face_n) > -OPPOSED:
+            share = opposition(-np.dot(normal, normals[f]))
+            if share <= 0.0:
                 continue
             out_key[count] = first_key + s
             out_face[count] = f
@@ -164,8 +219,10 @@ def find_soft_plane(
             out_gap[count] = d
             out_normal[count] = normal
             out_arm[count] = 0.0
-            out_stiffness[count] = sample_stiffness[s]
+            out_stiffness[count] = share * sample_stiffness[s]
             out_rigid[count] = -1
+            out_turns[count] = 0
+            out_curve[count] = 0.0
             count += 1
     return count
 
@@ -173,7 +230,8 @@ def find_soft_plane(
 @njit(cache=True)
 def find_rigid_plane(
     points, ball_radius, centre, rotation, point, normal, stiffness, rigid, first_key,
-    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
+    count,
 ):
     """Append the support points of a rigid body below a plane; return the new count.
 
@@ -200,6 +258,8 @@ def find_rigid_plane(
         out_arm[count] = arm
         out_stiffness[count] = stiffness
         out_rigid[count] = rigid
+        out_turns[count] = 0 if ball_radius > 0.0 else -1
+        out_curve[count] = 0.0
         count += 1
     return count
 
@@ -287,28 +347,31 @@ def near_triangles(positions, faces, triangle_face, points, reach, low, high, pa
 
 
 @njit(cache=True)
-def find_feature_soft(
-    positions, faces, triangle_face, triangle_weight, pairs, points, outward, feature_stiffness, centre, rotation, rigid,
-    first_key, depth, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, count,
+def pair_features(
+    positions, faces, smooth, triangle_face, triangle_weight, pairs, points, outward, centre, rotation, depth, reach, blend,
+    out_point, out_face, out_weight, out_normal, out_share,
 ):
-    """Append the features of a rigid body that lie inside a soft body; return the new count.
+    """Write for each feature of a rigid body near a soft body the tangent plane of the nearest surface point; return how many.
 
-    pairs: candidate (point, triangle) of one soft body, sorted by point; shape (n, 2). The gap of a point is the signed
-    distance to the nearest triangle; where several are equally near (an edge), the one that faces the point most
-    decides the sign. outward: unit pseudonormals of the features, body frame, shape (n, 3); a feature whose nearest
-    triangle does not look at it is left out, as in `find_soft_rigid`. Points deeper than ``depth`` [m] are left out: they are nearer to the wall's other side.
+    pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); outward: unit pseudonormals of the
+    features, body frame, shape (n_points, 3). A plane goes through the point ``out_weight`` of ``out_face``; its normal
+    (written reversed, so that it points from the rigid to the soft side) is interpolated from the vertices' ``smooth``
+    normals (n_faces, k, 3), so that it does not jump as the point slides from face to face, and turns into the direction
+    of the distance over the first ``blend`` [m] outside. Where several triangles are equally near (a sharp edge), the
+    one that faces the point most is taken. Points farther out than ``reach`` [m], or deeper than ``depth`` (they are nearer to the wall's other side), are left out.
     """
-    p, arm, bary, cp, best_n = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    p, bary, cp, best_n, best_delta = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     corner, best_weight = np.empty((3, 3)), np.empty(faces.shape[1])
-    i0 = 0
+    count, i0 = 0, 0
     while i0 < pairs.shape[0]:
         i1 = i0
         while i1 < pairs.shape[0] and pairs[i1, 0] == pairs[i0, 0]:
             i1 += 1
         q = pairs[i0, 0]
         for i in range(3):
-            arm[i] = rotation[i, 0] * points[q, 0] + rotation[i, 1] * points[q, 1] + rotation[i, 2] * points[q, 2]
-            p[i] = centre[i] + arm[i]
+            p[i] = centre[i]
+            for j in range(3):
+                p[i] += rotation[i, j] * points[q, j]
         best, best_facing, best_t, best_gap = np.inf, -1.0, -1, 0.0
         for c in range(i0, i1):
             t = pairs[c, 1]
@@ -323,34 +386,67 @@ def find_feature_soft(
             n = np.cross(corner[1] - corner[0], corner[2] - corner[0])
             n /= max(math.sqrt(np.dot(n, n)), 1e-300)
             height = np.dot(delta, n)
-            facing = abs(height) / distance if distance > 1e-12 else 1.0
+            facing = abs(height) / distance if distance > 1e-9 else 1.0
             if distance < best - 1e-9 or (distance < best + 1e-9 and facing > best_facing):
                 best, best_facing, best_t = distance, facing, t
                 best_gap = distance if height > 0.0 else -distance
+                best_delta[:] = delta
                 for a in range(nodes.shape[0]):
                     best_weight[a] = (
                         bary[0] * triangle_weight[t, 0, a] + bary[1] * triangle_weight[t, 1, a]
                         + bary[2] * triangle_weight[t, 2, a]
                     )
-                if facing > 0.999999:
-                    best_n[:] = n
-                else:
-                    best_n[:] = delta / best_gap
+        i0 = i1
+        best_n[:] = 0.0
+        for a in range(best_weight.shape[0]):
+            best_n += best_weight[a] * smooth[triangle_face[best_t], a]
+        best_n /= max(math.sqrt(np.dot(best_n, best_n)), 1e-300)
+        if best_gap > 0.0:
+            best_n = best_n * (1.0 - min(best_gap / blend, 1.0)) + best_delta * (min(1.0 / blend, 1.0 / best_gap))
+            best_n /= max(math.sqrt(np.dot(best_n, best_n)), 1e-300)
+        if best_gap > reach or best_gap < -depth:
+            continue
         facing_out = 0.0
         for i in range(3):
             for j in range(3):
                 facing_out -= best_n[i] * rotation[i, j] * outward[q, j]
-        if -depth < best_gap < 0.0 and facing_out > OPPOSED:
-            out_key[count] = first_key + q
-            out_face[count] = triangle_face[best_t]
-            out_weight[count] = best_weight
-            out_gap[count] = best_gap
-            out_normal[count] = -best_n
-            out_arm[count] = arm
-            out_stiffness[count] = feature_stiffness[q]
-            out_rigid[count] = rigid
-            count += 1
-        i0 = i1
+        out_point[count] = q
+        out_face[count] = triangle_face[best_t]
+        out_weight[count] = best_weight
+        out_normal[count] = -best_n
+        out_share[count] = opposition(facing_out)
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def find_feature_plane(
+    positions, faces, plane_point, plane_face, plane_weight, plane_normal, plane_stiffness, points, centre, rotation,
+    rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
+    count,
+):
+    """Append the features of a rigid body below the tangent planes that `pair_features` gave them; return the new count."""
+    x, arm = np.empty(3), np.empty(3)
+    for c in range(plane_point.shape[0]):
+        q = plane_point[c]
+        face_point(positions, faces[plane_face[c]], plane_weight[c], x)
+        gap = 0.0
+        for i in range(3):
+            arm[i] = rotation[i, 0] * points[q, 0] + rotation[i, 1] * points[q, 1] + rotation[i, 2] * points[q, 2]
+            gap -= plane_normal[c, i] * (centre[i] + arm[i] - x[i])
+        if gap >= 0.0:
+            continue
+        out_key[count] = first_key + q
+        out_face[count] = plane_face[c]
+        out_weight[count] = plane_weight[c]
+        out_gap[count] = gap
+        out_normal[count] = plane_normal[c]
+        out_arm[count] = arm
+        out_stiffness[count] = plane_stiffness[c]
+        out_rigid[count] = rigid
+        out_turns[count] = -1
+        out_curve[count] = 0.0
+        count += 1
     return count
 
 
@@ -418,11 +514,48 @@ def _add_row(
 
 
 @njit(cache=True)
+def _add_turning(faces, face, weight, rigid, turns, force, normal, arm, coupling, rigid_matrix):
+    r"""Add what the turning of a rigid body does to a contact's Hessian at the normal force ``force`` [N].
+
+    With the spin v and the motion u of the soft point relative to the centre of mass, the gap n . (x - c) changes in second
+    order by n . (v x (v x r)) / 2 - n . (v x u) if the normal turns along, and by -n . (v x (v x r)) / 2 if it stays.
+    """
+    r0 = 6 * rigid
+    along = normal[0] * arm[0] + normal[1] * arm[1] + normal[2] * arm[2]
+    for i in range(3):
+        for j in range(3):
+            h = 0.5 * (normal[i] * arm[j] + arm[i] * normal[j])
+            if i == j:
+                h -= along
+            rigid_matrix[r0 + 3 + i, r0 + 3 + j] -= turns * force * h
+    if turns != 1:
+        return
+    cross = np.zeros((3, 3))
+    cross[0, 1], cross[0, 2] = -normal[2], normal[1]
+    cross[1, 0], cross[1, 2] = normal[2], -normal[0]
+    cross[2, 0], cross[2, 1] = -normal[1], normal[0]
+    for i in range(3):
+        for j in range(3):
+            h = force * cross[i, j]
+            rigid_matrix[r0 + i, r0 + 3 + j] -= h
+            rigid_matrix[r0 + 3 + j, r0 + i] -= h
+            if face >= 0:
+                for a in range(faces.shape[1]):
+                    n = faces[face, a]
+                    if n >= 0:
+                        coupling[3 * n + i, r0 + 3 + j] += weight[a] * h
+
+
+@njit(cache=True)
 def add_normal(
-    faces, face_slots, face, weight, gap, normal, arm, stiffness, rigid, count, smoothing,
-    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_gradient, want_hessian,
+    faces, face_slots, face, weight, gap, normal, arm, stiffness, rigid, turns, curve, count, smoothing,
+    gradient, rigid_gradient, blocks, coupling, rigid_matrix, want_gradient, want_hessian, exact,
 ):
-    """Add gradient and (Gauss-Newton, so positive semidefinite) Hessian of the penalty, as wanted; return the energy [J]."""
+    """Add gradient and Hessian of the penalty, as wanted; return the energy [J].
+
+    ``exact``: with the terms of the gap's second derivative (curvature, and turning of the rigid body), without which the
+    Hessian is Gauss-Newton's and positive semidefinite.
+    """
     energy = 0.0
     spin, matrix, force = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
     for c in range(count):
@@ -432,6 +565,8 @@ def add_normal(
             force[i] = -f * normal[c, i]
             for j in range(3):
                 matrix[i, j] = df * normal[c, i] * normal[c, j]
+                if exact:
+                    matrix[i, j] -= f * curve[c, i, j]
         # -dphi x arm = [arm] dphi
         spin[0, 0] = spin[1, 1] = spin[2, 2] = 0.0
         spin[0, 1], spin[0, 2] = -arm[c, 2], arm[c, 1]
@@ -441,6 +576,8 @@ def add_normal(
             faces, face_slots, face[c], weight[c], rigid[c], spin, force, matrix, gradient, rigid_gradient,
             blocks, coupling, rigid_matrix, want_gradient, want_hessian,
         )
+        if want_hessian and exact and turns[c] != 0 and rigid[c] >= 0:
+            _add_turning(faces, face[c], weight[c], rigid[c], turns[c], f, normal[c], arm[c], coupling, rigid_matrix)
     return energy
 
 

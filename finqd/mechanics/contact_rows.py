@@ -38,6 +38,21 @@ class FrictionRows:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class FeaturePlanes:
+    """Tangent planes that the features of one rigid body meet on one soft body; n planes, held over a Newton solve.
+
+    point: feature, face: soft face, (n,); weight: the plane's point on the face, (n, k)
+    normal: unit, from the rigid to the soft side, (n, 3); stiffness [N/m], (n,)
+    """
+
+    point: np.ndarray
+    face: np.ndarray
+    weight: np.ndarray
+    normal: np.ndarray
+    stiffness: np.ndarray
+
+
 class Rows:
     """Contacts at one state: ``count`` of at most ``capacity`` rows are in use; see `contact_kernels` for the columns."""
 
@@ -51,11 +66,16 @@ class Rows:
         self.arm = np.zeros((capacity, 3))
         self.stiffness = np.zeros(capacity)
         self.rigid = np.zeros(capacity, dtype=np.int64)
+        self.turns = np.zeros(capacity, dtype=np.int64)
+        self.curve = np.zeros((capacity, 3, 3))
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
         """All columns, in the order in which kernels take them."""
-        return self.key, self.face, self.weight, self.gap, self.normal, self.arm, self.stiffness, self.rigid
+        return (
+            self.key, self.face, self.weight, self.gap, self.normal, self.arm, self.stiffness, self.rigid, self.turns,
+            self.curve,
+        )
 
     def forces(self, smoothing: float) -> np.ndarray:
         """Return the normal forces [N], shape (count,); see `contact_kernels.normal_force`."""

@@ -146,7 +146,7 @@ class System:
         d = self.derivatives
         for potential, slots in zip(self.potentials, self.slots, strict=True):
             potential.add_hessian(state.positions, slots, d.blocks, projected=projected)
-        self.contact.add_hessian(state, d)
+        self.contact.add_hessian(state, d, projected=projected)
 
     def hold_fixed(self) -> None:
         """Make held degrees of freedom drop out of the Hessian."""

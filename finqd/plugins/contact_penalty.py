@@ -9,7 +9,7 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from finqd.mechanics import contact_kernels as kernels
-from finqd.mechanics.contact_rows import FrictionRows, Rows
+from finqd.mechanics.contact_rows import FeaturePlanes, FrictionRows, Rows
 from finqd.mechanics.contact_surface import contact_surface
 from finqd.mechanics.distance_kernels import signed_distances
 from finqd.mechanics.pattern import BlockPattern
@@ -21,7 +21,10 @@ from finqd.units import MM
 
 FEATURE_WIDTH = 1.0 * MM  # a sharp edge is as stiff as a strip of this width on the face it presses into
 CORNER_LENGTH = 1.0 * MM  # and a corner as this length of edge
+SHARE_RATE = 0.3  # share of the way to its new value that a feature's share of its stiffness goes in a step
 FEATURE_REACH = 4.0 * MM  # candidates (feature, triangle) are looked up again before anything has moved this far
+FEATURE_MARGIN = 1.0 * MM  # features within this distance of a soft face get its tangent plane at the start of a step
+FEATURE_BLEND = 0.2 * MM  # over this distance outside, a plane's normal turns from the surface's to the distance's
 FEATURE_DEPTH = 1.5 * MM  # features deeper than this inside a wall belong to its other side
 
 
@@ -34,6 +37,7 @@ class Penalty:
     sample_spacing_mm: largest distance of the points on soft faces that feel contact
     friction_stiffness_ratio: tangential over normal stiffness
     step_allowance_mm: how far a point may move into a body in one Newton step
+    slide_limit_mm: how far an edge or corner may slide over a soft face in one step
     weight_penetration_mm: how far a rigid body sinks into the floor at most on one support point under its own weight
     """
 
@@ -42,6 +46,7 @@ class Penalty:
     sample_spacing_mm: Annotated[float, Gt(0), Le(20)] = 1.5
     friction_stiffness_ratio: Annotated[float, Gt(0), Le(10)] = 0.5
     step_allowance_mm: Annotated[float, Gt(0), Le(10)] = 0.5
+    slide_limit_mm: Annotated[float, Gt(0), Le(100)] = 0.5
     weight_penetration_mm: Annotated[float, Gt(0), Le(1)] = 0.01
 
     def potential(self, scene: Scene) -> PenaltyContact:
@@ -78,7 +83,13 @@ class PenaltyContact:
         self.friction = FrictionRows.empty(self.surface.faces.shape[1])
         self.slips = np.zeros((self.n_keys, 3))
         self.bounds = np.zeros(self.n_keys)  # lagged mu N of each key [N]
+        self.normals = np.zeros((len(self.surface.faces), 3))
+        self.facing = np.zeros_like(self.normals)
+        self.shares = self.fresh_shares = np.full(self.n_keys, np.nan)
+        self.smooth = np.zeros((*self.surface.faces.shape, 3))
+        self.planes: list[list[FeaturePlanes]] = []
         self.soft_forces = np.zeros(len(scene.soft_bodies))
+        self.relagged_forces = self.soft_forces
         self.penetration = 0.0
         self.start: State | None = None
         self.last_rows_state: State | None = None
@@ -119,10 +130,14 @@ class PenaltyContact:
     def begin_step(self, state: State) -> None:
         """Take reference points and normals, and the friction bounds, from ``state``, the start of a step."""
         self.start = state
+        # how far contacts look at each other is fixed for a step: a dent turns them, and they would flicker
+        self.fresh_shares = np.full(self.n_keys, np.nan)
+        kernels.face_normals(state.positions, self.surface.faces, self.surface.face_corners, self.facing)
         self.relag(state)
 
     def relag(self, state: State) -> float:
         """Renew the friction bounds at ``state``; return which share of them, in sum, has changed since the last time."""
+        self._hold_geometry(state)
         self._find(state)
         bounds = np.zeros(self.n_keys)
         rows = self.rows
@@ -132,6 +147,7 @@ class PenaltyContact:
         total = max(float(np.sum(bounds)), float(np.sum(self.bounds)))
         change = float(np.sum(np.abs(bounds - self.bounds))) / total if total > 0.0 else 0.0
         self.bounds = bounds
+        self.relagged_forces = self._forces_by_body(force)
         self.friction = rows.friction(
             state=state, start=self.start, faces=self.surface.faces, bounds=bounds, slips=self.slips,
             ratio=self.options.friction_stiffness_ratio,
@@ -152,17 +168,19 @@ class PenaltyContact:
         energy, slips = self._add(state, derivatives, gradient=True)
         return energy + kernels.friction_energy(slips, self.friction.bound, self.friction.stiffness, len(slips))
 
-    def add_hessian(self, state: State, derivatives: Derivatives) -> None:
-        """Add the positive semidefinite Hessian: exact for friction, Gauss-Newton for the penalty."""
-        self._add(state, derivatives, gradient=False)
+    def add_hessian(self, state: State, derivatives: Derivatives, *, projected: bool = False) -> None:
+        """Add the Hessian; ``projected``: a positive semidefinite one, exact for friction, Gauss-Newton for the penalty."""
+        self._add(state, derivatives, gradient=False, exact=not projected)
 
-    def _add(self, state: State, d: Derivatives, *, gradient: bool) -> tuple[float, np.ndarray]:
+    def _add(
+        self, state: State, d: Derivatives, *, gradient: bool, exact: bool = False
+    ) -> tuple[float, np.ndarray]:
         self._find(state)
         rows, f = self.rows, self.friction
         out = (d.soft, d.rigid, d.blocks, d.coupling, d.rigid_matrix, gradient, not gradient)
         energy = kernels.add_normal(
             self.surface.faces, self.face_slots, rows.face, rows.weight, rows.gap, rows.normal, rows.arm,
-            rows.stiffness, rows.rigid, rows.count, self.options.smoothing_mm * MM, *out,
+            rows.stiffness, rows.rigid, rows.turns, rows.curve, rows.count, self.options.smoothing_mm * MM, *out, exact,
         )
         slips = self._trial_slips(state)
         kernels.add_friction(
@@ -198,6 +216,26 @@ class PenaltyContact:
                 limit = min(limit, kernels.plane_step_limit(heights, -moves @ plane.normal, allowance))
         return limit
 
+    def strain(self, state: State) -> float:
+        """Return the longest slide of a feature over a soft face in this step, in multiples of ``slide_limit_mm``.
+
+        The tangent planes that features meet are held over a solve, so a longer slide would leave them behind.
+        """
+        self._find(state)
+        rows, start = self.rows, self.start
+        used = np.flatnonzero((rows.turns[: rows.count] == -1) & (rows.face[: rows.count] >= 0))
+        if not len(used):
+            return 0.0
+        nodes = self.surface.faces[rows.face[used]]
+        moved = (state.positions - start.positions)[nodes] * (nodes >= 0)[:, :, None]
+        slide = np.einsum("na,nax->nx", rows.weight[used], moved)
+        for r in range(len(self.scene.rigid_bodies)):
+            mine = rows.rigid[used] == r
+            arm = rows.arm[used][mine]
+            turn = start.rigid_rotations[r] @ state.rigid_rotations[r].T
+            slide[mine] -= state.rigid_positions[r] - start.rigid_positions[r] + arm - arm @ turn.T
+        return float(np.max(np.linalg.norm(slide, axis=1))) / (self.options.slide_limit_mm * MM)
+
     def commit(self, state: State) -> None:
         """Accept ``state``: return mapping of the elastic slip; forces and penetration for the outside."""
         friction = self.friction
@@ -208,13 +246,18 @@ class PenaltyContact:
             slips[mine] = slips[mine] @ state.rigid_rotations[r]
         self.slips = np.zeros_like(self.slips)
         self.slips[friction.key] = slips
+        self.shares = self.fresh_shares
+        self._hold_geometry(state)  # so that what is reported is the true penetration
         self._find(state)
         rows = self.rows
-        force = rows.forces(self.options.smoothing_mm * MM)
-        soft = rows.face[: rows.count] >= 0
-        body = self.surface.face_body[rows.face[: rows.count][soft]]
-        self.soft_forces = np.bincount(body, force[soft], minlength=len(self.scene.soft_bodies))
+        self.soft_forces = self._forces_by_body(rows.forces(self.options.smoothing_mm * MM))
         self.penetration = float(np.max(-rows.gap[: rows.count], initial=0.0))
+
+    def _forces_by_body(self, force: np.ndarray) -> np.ndarray:
+        """Return the summed normal force on each soft body [N], from that of each row."""
+        face = self.rows.face[: self.rows.count]
+        soft = face >= 0
+        return np.bincount(self.surface.face_body[face[soft]], force[soft], minlength=len(self.scene.soft_bodies))
 
     def _trial_slips(self, state: State) -> np.ndarray:
         f, start = self.friction, self.start
@@ -244,21 +287,20 @@ class PenaltyContact:
             return
         rows, surface, scene = self.rows, self.surface, self.scene
         samples = (
-            surface.faces, surface.face_corners, surface.first_sample, surface.sample_weight, self.sample_stiffness
+            surface.faces, self.facing, surface.first_sample, surface.sample_weight, self.sample_stiffness
         )
         rows.count = 0
-        self._renew_pairs(state)
         for r, body in enumerate(scene.rigid_bodies):
             pose = (np.ascontiguousarray(state.rigid_positions[r]), np.ascontiguousarray(state.rigid_rotations[r]))
             rows.count = kernels.find_soft_rigid(
                 state.positions, *samples, *pose, body.shape.distance, *self.boxes[r], float(body.shape.bounding_radius), r,
                 self.first_key["rigid", r], *rows.arrays, rows.count,
             )
-            for b, pairs in enumerate(self._pairs[r]):
-                rows.count = kernels.find_feature_soft(
-                    state.positions, surface.faces, surface.triangle_face, surface.triangle_weight, pairs,
-                    body.shape.feature_points, self.feature_normals[r], self.feature_stiffness[r], *pose, r, self.first_key["feature", r, b],
-                    FEATURE_DEPTH, *rows.arrays, rows.count,
+            for b, planes in enumerate(self.planes[r]):
+                rows.count = kernels.find_feature_plane(
+                    state.positions, surface.faces, planes.point, planes.face, planes.weight, planes.normal,
+                    planes.stiffness, body.shape.feature_points, *pose, r, self.first_key["feature", r, b],
+                    *rows.arrays, rows.count,
                 )
             for p, plane in enumerate(scene.planes):
                 rows.count = kernels.find_rigid_plane(
@@ -270,6 +312,39 @@ class PenaltyContact:
                 state.positions, *samples, plane.point, plane.normal, self.first_key["plane", p], *rows.arrays, rows.count,
             )
         self.last_rows_state = state
+
+    def _hold_geometry(self, state: State) -> None:
+        """Fix what varies slowly and would make Newton's method stumble: face normals, and features' tangent planes."""
+        surface = self.surface
+        kernels.face_normals(state.positions, surface.faces, surface.face_corners, self.normals)
+        kernels.smooth_normals(self.normals, surface.first_neighbour, surface.neighbour, self.smooth)
+        self._renew_pairs(state)
+        self.planes = [
+            [self._feature_planes(r, body, pairs, state) for body, pairs in enumerate(self._pairs[r])] for r in range(len(self.scene.rigid_bodies))
+        ]
+        self.last_rows_state = None
+
+    def _feature_planes(self, r: int, body: int, pairs: np.ndarray, state: State) -> FeaturePlanes:
+        surface, shape = self.surface, self.scene.rigid_bodies[r].shape
+        n = len(shape.feature_points)
+        point, face, share = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n)
+        weight, normal = np.empty((n, surface.faces.shape[1])), np.empty((n, 3))
+        count = kernels.pair_features(
+            state.positions, surface.faces, self.smooth, surface.triangle_face, surface.triangle_weight, pairs,
+            shape.feature_points,
+            self.feature_normals[r], np.ascontiguousarray(state.rigid_positions[r]),
+            np.ascontiguousarray(state.rigid_rotations[r]), FEATURE_DEPTH, FEATURE_MARGIN, FEATURE_BLEND,
+            point, face, weight, normal, share,
+        )
+        point, share = point[:count], share[:count]
+        key = self.first_key["feature", r, body] + point
+        old, fixed = self.shares[key], self.fresh_shares[key]
+        share = np.where(np.isnan(fixed), np.where(np.isnan(old), share, old + SHARE_RATE * (share - old)), fixed)
+        self.fresh_shares[key] = share
+        return FeaturePlanes(
+            point=point, face=face[:count], weight=weight[:count], normal=normal[:count],
+            stiffness=share * self.feature_stiffness[r][point],
+        )
 
     def _renew_pairs(self, state: State) -> None:
         """Look up candidate (feature, triangle) pairs if anything may have come near since the last time."""

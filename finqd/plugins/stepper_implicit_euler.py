@@ -14,6 +14,10 @@ from finqd.mechanics.state import Direction, State, StepReport
 from finqd.mechanics.system import System
 
 ARMIJO = 1e-4  # share of the linear decrease that a step must reach (Nocedal and Wright, Numerical Optimization, 3.1)
+LAG_FORCE = 0.05  # [N] what renewed contact may leave unbalanced at the end of a step,
+LAG_SHARE = 0.05  # or this share of the largest normal force on a body
+LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
+EARLY = 100.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
 
@@ -31,9 +35,9 @@ class ImplicitEuler:
     linear_iterations: cap on CG iterations
     """
 
-    tolerance_N: Annotated[float, Gt(0), Le(1)] = 1e-5
+    tolerance_N: Annotated[float, Gt(0), Le(1)] = 5e-5
     max_iterations: Annotated[int, Ge(1), Le(1000)] = 40
-    max_friction_updates: Annotated[int, Ge(0), Le(100)] = 4
+    max_friction_updates: Annotated[int, Ge(0), Le(100)] = 3
     friction_tolerance: Annotated[float, Gt(0), Le(1)] = 0.02
     linear_solver: Literal["cg", "direct"] = "cg"
     preconditioner: Literal["factorisation", "block_jacobi", "jacobi"] = "factorisation"
@@ -54,27 +58,27 @@ class ImplicitEuler:
         return end, report
 
     def _minimise(self, system: System, increment: EulerIncrement, trial: State, report: StepReport) -> State:
-        """Run Newton's method from ``trial``; ``report`` says how it went."""
+        """Run Newton's method from ``trial``, renewing what contact lags; ``report`` says how it went."""
         energy = increment.gradient(trial)
+        report.residual, report.where = system.residual()
+        early, last_jump = True, np.inf
         while True:
-            report.residual, report.where = system.residual()
             report.residuals.append(report.residual)
-            if not np.isfinite(report.residual) or not np.isfinite(energy):
+            if not (np.isfinite(report.residual) and np.isfinite(energy)):
                 report.reason = f"the forces are no longer finite ({report.where})"
                 return trial
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
-            if report.residual <= self.tolerance_N and (report.iterations or report.residual <= 1e-3 * self.tolerance_N):
-                if report.friction_updates >= self.max_friction_updates:
-                    break
-                if system.contact.relag(trial) <= self.friction_tolerance:
-                    break
-                report.friction_updates += 1
+            done = report.residual <= self.tolerance_N and report.iterations > 0
+            if done or (early and report.iterations and report.residual <= EARLY * self.tolerance_N):
+                jump, change = self._renew(system, increment, trial, report)
+                if done and self._settles(system, trial, report, jump=jump, last_jump=last_jump, change=change):
+                    return trial
+                early, last_jump = False, jump if done else np.inf
                 energy = increment.gradient(trial)
                 continue
-            if report.iterations >= self.max_iterations:
-                report.reason = (
-                    f"no equilibrium after {report.iterations} iterations: {report.residual:.3g} N left on {report.where}"
-                )
+            if report.iterations >= self.max_iterations * (1 + report.friction_updates):
+                left = f"{report.residual:.3g} N left on {report.where}"
+                report.reason = f"no equilibrium after {report.iterations} iterations: {left}"
                 return trial
             report.iterations += 1
             moved = self._iterate(system, increment, trial, energy, report)
@@ -82,8 +86,37 @@ class ImplicitEuler:
                 return trial
             trial = moved
             energy = increment.gradient(trial)
-        report.converged = True
-        return trial
+            report.residual, report.where = system.residual()
+
+    def _renew(
+        self, system: System, increment: EulerIncrement, trial: State, report: StepReport
+    ) -> tuple[float, float]:
+        """Renew what contact lags; return the residual it leaves [N] and the share of friction bounds that changed."""
+        change = system.contact.relag(trial)
+        report.friction_updates += 1
+        increment.gradient(trial)
+        report.residual, report.where = system.residual()
+        return report.residual, change
+
+    def _settles(
+        self, system: System, trial: State, report: StepReport, *, jump: float, last_jump: float, change: float
+    ) -> bool:
+        """Say whether a balanced state ends the step: it stays balanced with renewed contact, or renewing leads no further.
+
+        In the latter case the contact geometry may jump between two faces; what is left must be small beside the
+        contact forces, else the step was too long.
+        """
+        if system.contact.strain(trial) > 1.0:
+            report.reason = "edges slid too far over soft faces in one step"
+            return True
+        if jump > self.tolerance_N and change > self.friction_tolerance or jump > LAG_FORCE:
+            if report.friction_updates <= self.max_friction_updates and jump < LAG_PROGRESS * last_jump:
+                return False
+        bound = max(LAG_FORCE, LAG_SHARE * float(np.max(system.contact.relagged_forces, initial=0.0)))
+        report.converged = jump <= bound
+        if not report.converged:
+            report.reason = f"contact moved on too fast: {jump:.3g} N left on {report.where}"
+        return True
 
     def _iterate(
         self, system: System, increment: EulerIncrement, trial: State, energy: float, report: StepReport
