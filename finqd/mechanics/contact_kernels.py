@@ -17,6 +17,7 @@ from numba import njit
 
 from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, signed_distance
 
+RISE = 0.01  # slope over the first plane from which a neighbouring triangle makes a dent
 OPPOSED, FULLY_OPPOSED = 0.05, 0.35  # cosines between which two surfaces that look at each other come to push fully
 
 
@@ -117,18 +118,6 @@ def face_normals(positions, faces, corners, normals):
             a, b = positions[nodes[2]] - positions[nodes[0]], positions[nodes[3]] - positions[nodes[1]]
         n = np.cross(a, b)
         normals[f] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
-
-
-@njit(cache=True)
-def smooth_normals(normals, first_neighbour, neighbour, smooth):
-    """Write the mean unit normal of the faces that meet smoothly at each vertex of each face, shape (n_faces, k, 3)."""
-    k = smooth.shape[1]
-    for f in range(smooth.shape[0]):
-        for a in range(k):
-            n = np.zeros(3)
-            for i in range(first_neighbour[f * k + a], first_neighbour[f * k + a + 1]):
-                n += normals[neighbour[i]]
-            smooth[f, a] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
 
 
 @njit(cache=True)
@@ -347,21 +336,65 @@ def near_triangles(positions, faces, triangle_face, points, reach, low, high, pa
 
 
 @njit(cache=True)
+def _triangle(positions, faces, triangle_face, triangle_weight, t, corner, normal):
+    """Write the corners [m] and the unit normal of triangle ``t``."""
+    nodes = faces[triangle_face[t]]
+    for v in range(3):
+        face_point(positions, nodes, triangle_weight[t, v], corner[v])
+    n = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+    normal[:] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
+
+
+@njit(cache=True)
+def _write_plane(row, q, t, bary, normal, triangle_face, triangle_weight, out_point, out_face, out_weight, out_normal):
+    """Write the plane through the point ``bary`` of triangle ``t`` for feature ``q``; the normal is written reversed."""
+    out_point[row] = q
+    out_face[row] = triangle_face[t]
+    for a in range(out_weight.shape[1]):
+        out_weight[row, a] = (
+            bary[0] * triangle_weight[t, 0, a] + bary[1] * triangle_weight[t, 1, a] + bary[2] * triangle_weight[t, 2, a]
+        )
+    for i in range(3):
+        out_normal[row, i] = -normal[i]
+
+
+@njit(cache=True)
+def _nearest_triangle(p, positions, faces, triangle_face, triangle_weight, pairs, i0, i1, distance):
+    """Return the triangle of pairs i0 to i1 nearest to ``p``, and the signed distance; fill ``distance`` for each pair [m].
+
+    Where several are equally near (an edge), the one that faces the point most is taken.
+    """
+    corner, n, bary = np.empty((3, 3)), np.empty(3), np.empty(3)
+    best, best_facing, best_pair, gap = np.inf, -1.0, i0, 0.0
+    for c in range(i0, i1):
+        _triangle(positions, faces, triangle_face, triangle_weight, pairs[c, 1], corner, n)
+        closest_on_triangle(p, corner[0], corner[1], corner[2], bary)
+        delta = p - bary[0] * corner[0] - bary[1] * corner[1] - bary[2] * corner[2]
+        d = math.sqrt(np.dot(delta, delta))
+        height = np.dot(delta, n)
+        facing = abs(height) / d if d > 1e-9 else 1.0
+        distance[c] = d
+        if d < best - 1e-9 or (d < best + 1e-9 and facing > best_facing):
+            best, best_facing, best_pair = d, facing, c
+            gap = d if height > 0.0 else -d
+    return best_pair, gap
+
+
+@njit(cache=True)
 def pair_features(
-    positions, faces, smooth, triangle_face, triangle_weight, pairs, points, outward, centre, rotation, depth, reach, blend,
+    positions, faces, triangle_face, triangle_weight, pairs, points, outward, centre, rotation, depth, reach, near,
     out_point, out_face, out_weight, out_normal, out_share,
 ):
-    """Write for each feature of a rigid body near a soft body the tangent plane of the nearest surface point; return how many.
+    """Write the planes that the features of a rigid body meet on a soft body; return how many.
 
     pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); outward: unit pseudonormals of the
-    features, body frame, shape (n_points, 3). A plane goes through the point ``out_weight`` of ``out_face``; its normal
-    (written reversed, so that it points from the rigid to the soft side) is interpolated from the vertices' ``smooth``
-    normals (n_faces, k, 3), so that it does not jump as the point slides from face to face, and turns into the direction
-    of the distance over the first ``blend`` [m] outside. Where several triangles are equally near (a sharp edge), the
-    one that faces the point most is taken. Points farther out than ``reach`` [m], or deeper than ``depth`` (they are nearer to the wall's other side), are left out.
+    features, body frame, shape (n_points, 3). Each point within ``reach`` [m] outside and ``depth`` inside (deeper
+    ones are nearer to the wall's other side) gets the plane of the nearest triangle, or, outside beyond a convex
+    edge, the plane across the direction of the distance. In a dent it gets the planes of the other triangles within
+    ``near`` [m] as well, as far as they rise over the first: it cannot be in balance on one side of a crease alone.
     """
-    p, bary, cp, best_n, best_delta = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    corner, best_weight = np.empty((3, 3)), np.empty(faces.shape[1])
+    p, bary, n, other = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    corner, distance = np.empty((3, 3)), np.empty(pairs.shape[0])
     count, i0 = 0, 0
     while i0 < pairs.shape[0]:
         i1 = i0
@@ -372,50 +405,38 @@ def pair_features(
             p[i] = centre[i]
             for j in range(3):
                 p[i] += rotation[i, j] * points[q, j]
-        best, best_facing, best_t, best_gap = np.inf, -1.0, -1, 0.0
-        for c in range(i0, i1):
-            t = pairs[c, 1]
-            nodes = faces[triangle_face[t]]
-            for v in range(3):
-                face_point(positions, nodes, triangle_weight[t, v], corner[v])
-            closest_on_triangle(p, corner[0], corner[1], corner[2], bary)
-            for i in range(3):
-                cp[i] = bary[0] * corner[0, i] + bary[1] * corner[1, i] + bary[2] * corner[2, i]
-            delta = p - cp
-            distance = math.sqrt(np.dot(delta, delta))
-            n = np.cross(corner[1] - corner[0], corner[2] - corner[0])
-            n /= max(math.sqrt(np.dot(n, n)), 1e-300)
-            height = np.dot(delta, n)
-            facing = abs(height) / distance if distance > 1e-9 else 1.0
-            if distance < best - 1e-9 or (distance < best + 1e-9 and facing > best_facing):
-                best, best_facing, best_t = distance, facing, t
-                best_gap = distance if height > 0.0 else -distance
-                best_delta[:] = delta
-                for a in range(nodes.shape[0]):
-                    best_weight[a] = (
-                        bary[0] * triangle_weight[t, 0, a] + bary[1] * triangle_weight[t, 1, a]
-                        + bary[2] * triangle_weight[t, 2, a]
-                    )
+        nearest, gap = _nearest_triangle(p, positions, faces, triangle_face, triangle_weight, pairs, i0, i1, distance)
+        first, last = i0, i1
         i0 = i1
-        best_n[:] = 0.0
-        for a in range(best_weight.shape[0]):
-            best_n += best_weight[a] * smooth[triangle_face[best_t], a]
-        best_n /= max(math.sqrt(np.dot(best_n, best_n)), 1e-300)
-        if best_gap > 0.0:
-            best_n = best_n * (1.0 - min(best_gap / blend, 1.0)) + best_delta * (min(1.0 / blend, 1.0 / best_gap))
-            best_n /= max(math.sqrt(np.dot(best_n, best_n)), 1e-300)
-        if best_gap > reach or best_gap < -depth:
+        if gap > reach or gap < -depth or count >= out_point.shape[0]:
             continue
+        _triangle(positions, faces, triangle_face, triangle_weight, pairs[nearest, 1], corner, n)
+        closest_on_triangle(p, corner[0], corner[1], corner[2], bary)
+        foot = bary[0] * corner[0] + bary[1] * corner[1] + bary[2] * corner[2]
+        if gap > 1e-6:
+            n[:] = (p - foot) / gap
         facing_out = 0.0
         for i in range(3):
             for j in range(3):
-                facing_out -= best_n[i] * rotation[i, j] * outward[q, j]
-        out_point[count] = q
-        out_face[count] = triangle_face[best_t]
-        out_weight[count] = best_weight
-        out_normal[count] = -best_n
+                facing_out -= n[i] * rotation[i, j] * outward[q, j]
+        _write_plane(
+            count, q, pairs[nearest, 1], bary, n, triangle_face, triangle_weight, out_point, out_face, out_weight, out_normal
+        )
         out_share[count] = opposition(facing_out)
         count += 1
+        for c in range(first, last):
+            if c == nearest or distance[c] > near or count >= out_point.shape[0]:
+                continue
+            _triangle(positions, faces, triangle_face, triangle_weight, pairs[c, 1], corner, other)
+            middle = (corner[0] + corner[1] + corner[2]) / 3.0
+            if np.dot(n, other) < 0.5 or np.dot(n, middle - foot) <= RISE * near:
+                continue
+            closest_on_triangle(p, corner[0], corner[1], corner[2], bary)
+            _write_plane(
+                count, q, pairs[c, 1], bary, other, triangle_face, triangle_weight, out_point, out_face, out_weight, out_normal
+            )
+            out_share[count] = out_share[count - 1]
+            count += 1
     return count
 
 

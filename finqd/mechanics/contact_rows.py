@@ -83,14 +83,14 @@ class Rows:
         return stiffness * np.where(depth < smoothing, depth**2 / (2.0 * smoothing), depth - 0.5 * smoothing)
 
     def friction(
-        self, *, state: State, start: State, faces: np.ndarray, bounds: np.ndarray, slips: np.ndarray, ratio: float
+        self, *, state: State, start: State, faces: np.ndarray, bound: np.ndarray, slips: np.ndarray, ratio: float
     ) -> FrictionRows:
         """Return the frictional contacts among the rows found at ``state``, referred to ``start``.
 
-        bounds: lagged mu N [N] by key; slips: stored elastic slip [m] by key, in the frame of the rigid body;
+        bound: lagged mu N [N] of each row; slips: stored elastic slip [m] by key, in the frame of the rigid body;
         ratio: tangential over normal stiffness.
         """
-        used = np.flatnonzero(bounds[self.key[: self.count]] > 0.0)
+        used = np.flatnonzero(bound > 0.0)
         key, face, rigid, weight = self.key[used], self.face[used], self.rigid[used], self.weight[used]
         point = np.zeros((len(used), 3))
         soft = face >= 0
@@ -103,6 +103,6 @@ class Rows:
             arm[mine] = arm[mine] @ (then @ state.rigid_rotations[r].T).T
             slip[mine] = slip[mine] @ then.T
         return FrictionRows(
-            key=key, face=face, weight=weight, rigid=rigid, bound=bounds[key], stiffness=ratio * self.stiffness[used],
+            key=key, face=face, weight=weight, rigid=rigid, bound=bound[used], stiffness=ratio * self.stiffness[used],
             normal=self.normal[used], start_point=point, start_arm=arm, start_slip=slip,
         )

@@ -11,8 +11,6 @@ import numpy as np
 from finqd.mechanics.elements import face_shape
 from finqd.scene import SoftBody
 
-SMOOTH = math.cos(math.radians(40.0))  # faces that meet at a smaller angle at rest are one smooth surface
-
 
 @dataclass(frozen=True, kw_only=True)
 class ContactSurface:
@@ -23,8 +21,6 @@ class ContactSurface:
     first_sample: samples first_sample[f] to first_sample[f + 1] lie on face f, shape (n_faces + 1,)
     sample_face, sample_weight (n_samples, k), sample_area [m^2]: points that are finer than the mesh; points that
         neighbouring faces share are merged, but not across a sharp edge, where each side needs its own normal
-    first_neighbour, neighbour: faces neighbour[first_neighbour[f k + a]:first_neighbour[f k + a + 1]] meet at vertex a of
-        face f without a sharp edge between, f itself among them: the surface's smooth normal there is their mean
     triangle_face, triangle_weight (n_triangles, 3, k): faces cut into flat triangles, corners as weights on the face
     """
 
@@ -35,8 +31,6 @@ class ContactSurface:
     sample_face: np.ndarray
     sample_weight: np.ndarray
     sample_area: np.ndarray
-    first_neighbour: np.ndarray
-    neighbour: np.ndarray
     triangle_face: np.ndarray
     triangle_weight: np.ndarray
 
@@ -147,27 +141,11 @@ def _merged(parts: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.n
     return face[first], weight[first], np.bincount(inverse.ravel(), area)
 
 
-def _smooth_neighbours(faces: np.ndarray, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (first_neighbour, neighbour) of `ContactSurface`; ``vectors``: along the faces' rest normals, (n_faces, 3)."""
-    normals = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    corner = np.flatnonzero(faces.ravel() >= 0)
-    order = corner[np.argsort(faces.ravel()[corner], kind="stable")]
-    face, vertex = order // faces.shape[1], faces.ravel()[order]
-    first, last = np.searchsorted(vertex, vertex, "left"), np.searchsorted(vertex, vertex, "right")
-    count = last - first
-    mine = np.repeat(np.arange(len(order)), count)
-    other = np.arange(len(mine)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
-    smooth = np.einsum("ix,ix->i", normals[face[mine]], normals[face[other]]) > SMOOTH
-    corners, neighbours = order[mine[smooth]], face[other[smooth]]
-    by_corner = np.argsort(corners, kind="stable")
-    return np.searchsorted(corners[by_corner], np.arange(faces.size + 1)), neighbours[by_corner]
-
-
 def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSurface:
     """Return the surface of ``bodies`` with samples at most ``spacing`` [m] apart; faces that are held are left out."""
     kinds = [(body, kind) for body in bodies for kind, faces in sorted(body.mesh.faces.items()) if len(faces)]
     width = max((body.mesh.faces[kind].shape[1] for body, kind in kinds), default=4)
-    faces, face_body, face_corners, directions, samples, triangles = [], [], [], [], [], []
+    faces, face_body, face_corners, samples, triangles = [], [], [], [], []
     first_face = 0
     for number, body in enumerate(bodies):
         parts = []
@@ -181,7 +159,6 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
             faces.append(padded)
             face_body.append(np.full(len(block), number))
             face_corners.append(np.full(len(block), 4 if kind.startswith("quad") else 3))
-            directions.append(_face_vectors(body.mesh.vertices[block], kind))
             parts.append(_samples(body.mesh.vertices[block], kind, first_face, spacing, width))
             corners = face_shape(kind, np.array(_TRIANGLES[kind], dtype=float).reshape(-1, 2)).reshape(-1, 3, block.shape[1])
             weight = np.zeros((len(block) * len(corners), 3, width))
@@ -195,17 +172,15 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
         return ContactSurface(
             faces=np.zeros((0, width), dtype=np.int64), face_body=empty, face_corners=empty,
             first_sample=np.zeros(1, dtype=np.int64), sample_face=empty,
-            sample_weight=np.zeros((0, width)), sample_area=np.zeros(0), first_neighbour=np.zeros(1, dtype=np.int64),
-            neighbour=empty, triangle_face=empty,
+            sample_weight=np.zeros((0, width)), sample_area=np.zeros(0), triangle_face=empty,
             triangle_weight=np.zeros((0, 3, width)),
         )
     sample_face, sample_weight, sample_area = (np.concatenate(p) for p in zip(*samples, strict=True))
     order = np.argsort(sample_face, kind="stable")
     sample_face, sample_weight, sample_area = sample_face[order], sample_weight[order], sample_area[order]
     triangle_face, triangle_weight = (np.concatenate(p) for p in zip(*triangles, strict=True))
-    first_neighbour, neighbour = _smooth_neighbours(np.concatenate(faces), np.concatenate(directions))
     return ContactSurface(
         faces=np.concatenate(faces), face_body=np.concatenate(face_body), face_corners=np.concatenate(face_corners),
         first_sample=np.searchsorted(sample_face, np.arange(first_face + 1)), sample_face=sample_face, sample_weight=sample_weight, sample_area=sample_area,
-        first_neighbour=first_neighbour, neighbour=neighbour, triangle_face=triangle_face, triangle_weight=triangle_weight,
+        triangle_face=triangle_face, triangle_weight=triangle_weight,
     )

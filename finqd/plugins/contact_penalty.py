@@ -24,7 +24,8 @@ CORNER_LENGTH = 1.0 * MM  # and a corner as this length of edge
 SHARE_RATE = 0.3  # share of the way to its new value that a feature's share of its stiffness goes in a step
 FEATURE_REACH = 4.0 * MM  # candidates (feature, triangle) are looked up again before anything has moved this far
 FEATURE_MARGIN = 1.0 * MM  # features within this distance of a soft face get its tangent plane at the start of a step
-FEATURE_BLEND = 0.2 * MM  # over this distance outside, a plane's normal turns from the surface's to the distance's
+FEATURE_NEAR = 1.0 * MM  # and in a dent those of other triangles this near
+PLANES = 8  # planes a feature has at most, on the average
 FEATURE_DEPTH = 1.5 * MM  # features deeper than this inside a wall belong to its other side
 
 
@@ -83,10 +84,8 @@ class PenaltyContact:
         self.friction = FrictionRows.empty(self.surface.faces.shape[1])
         self.slips = np.zeros((self.n_keys, 3))
         self.bounds = np.zeros(self.n_keys)  # lagged mu N of each key [N]
-        self.normals = np.zeros((len(self.surface.faces), 3))
-        self.facing = np.zeros_like(self.normals)
+        self.facing = np.zeros((len(self.surface.faces), 3))
         self.shares = self.fresh_shares = np.full(self.n_keys, np.nan)
-        self.smooth = np.zeros((*self.surface.faces.shape, 3))
         self.planes: list[list[FeaturePlanes]] = []
         self.soft_forces = np.zeros(len(scene.soft_bodies))
         self.relagged_forces = self.soft_forces
@@ -143,13 +142,14 @@ class PenaltyContact:
         rows = self.rows
         force = rows.forces(self.options.smoothing_mm * MM)
         keys = rows.key[: rows.count]
-        bounds[keys] = self.coefficients[keys] * force
+        bound = self.coefficients[keys] * force
+        np.add.at(bounds, keys, bound)  # a feature in a dent has several rows
         total = max(float(np.sum(bounds)), float(np.sum(self.bounds)))
         change = float(np.sum(np.abs(bounds - self.bounds))) / total if total > 0.0 else 0.0
         self.bounds = bounds
         self.relagged_forces = self._forces_by_body(force)
         self.friction = rows.friction(
-            state=state, start=self.start, faces=self.surface.faces, bounds=bounds, slips=self.slips,
+            state=state, start=self.start, faces=self.surface.faces, bound=bound, slips=self.slips,
             ratio=self.options.friction_stiffness_ratio,
         )
         return change
@@ -314,10 +314,7 @@ class PenaltyContact:
         self.last_rows_state = state
 
     def _hold_geometry(self, state: State) -> None:
-        """Fix what varies slowly and would make Newton's method stumble: face normals, and features' tangent planes."""
-        surface = self.surface
-        kernels.face_normals(state.positions, surface.faces, surface.face_corners, self.normals)
-        kernels.smooth_normals(self.normals, surface.first_neighbour, surface.neighbour, self.smooth)
+        """Fix what would make Newton's method stumble from face to face: the planes that features meet."""
         self._renew_pairs(state)
         self.planes = [
             [self._feature_planes(r, body, pairs, state) for body, pairs in enumerate(self._pairs[r])] for r in range(len(self.scene.rigid_bodies))
@@ -326,14 +323,14 @@ class PenaltyContact:
 
     def _feature_planes(self, r: int, body: int, pairs: np.ndarray, state: State) -> FeaturePlanes:
         surface, shape = self.surface, self.scene.rigid_bodies[r].shape
-        n = len(shape.feature_points)
+        n = PLANES * len(shape.feature_points)
         point, face, share = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n)
         weight, normal = np.empty((n, surface.faces.shape[1])), np.empty((n, 3))
         count = kernels.pair_features(
-            state.positions, surface.faces, self.smooth, surface.triangle_face, surface.triangle_weight, pairs,
+            state.positions, surface.faces, surface.triangle_face, surface.triangle_weight, pairs,
             shape.feature_points,
             self.feature_normals[r], np.ascontiguousarray(state.rigid_positions[r]),
-            np.ascontiguousarray(state.rigid_rotations[r]), FEATURE_DEPTH, FEATURE_MARGIN, FEATURE_BLEND,
+            np.ascontiguousarray(state.rigid_rotations[r]), FEATURE_DEPTH, FEATURE_MARGIN, FEATURE_NEAR,
             point, face, weight, normal, share,
         )
         point, share = point[:count], share[:count]

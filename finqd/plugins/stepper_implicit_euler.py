@@ -14,8 +14,8 @@ from finqd.mechanics.state import Direction, State, StepReport
 from finqd.mechanics.system import System
 
 ARMIJO = 1e-4  # share of the linear decrease that a step must reach (Nocedal and Wright, Numerical Optimization, 3.1)
-LAG_FORCE = 0.05  # [N] what renewed contact may leave unbalanced at the end of a step,
-LAG_SHARE = 0.05  # or this share of the largest normal force on a body
+LAG_FORCE = 0.1  # [N] what renewed contact may leave unbalanced at the end of a step,
+LAG_SHARE = 0.1  # or this share of the largest normal force on a body
 LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
 EARLY = 100.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
@@ -61,62 +61,55 @@ class ImplicitEuler:
         """Run Newton's method from ``trial``, renewing what contact lags; ``report`` says how it went."""
         energy = increment.gradient(trial)
         report.residual, report.where = system.residual()
-        early, last_jump = True, np.inf
+        early, best, best_jump = True, None, np.inf
         while True:
             report.residuals.append(report.residual)
             if not (np.isfinite(report.residual) and np.isfinite(energy)):
                 report.reason = f"the forces are no longer finite ({report.where})"
-                return trial
+                break
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
             done = report.residual <= self.tolerance_N and report.iterations > 0
+            if done and system.contact.strain(trial) > 1.0:
+                report.reason = "edges slid too far over soft faces in one step"
+                return trial
             if done or (early and report.iterations and report.residual <= EARLY * self.tolerance_N):
-                jump, change = self._renew(system, increment, trial, report)
-                if done and self._settles(system, trial, report, jump=jump, last_jump=last_jump, change=change):
-                    return trial
-                early, last_jump = False, jump if done else np.inf
+                early = False
+                change = system.contact.relag(trial)
+                report.friction_updates += 1
                 energy = increment.gradient(trial)
+                report.residual, report.where = system.residual()
+                progress = report.residual < LAG_PROGRESS * best_jump
+                if done and report.residual < best_jump:
+                    best, best_jump = trial, report.residual
+                still = report.residual <= self.tolerance_N or change <= self.friction_tolerance and report.residual <= LAG_FORCE
+                if done and (still or not progress or report.friction_updates > self.max_friction_updates):
+                    break
                 continue
             if report.iterations >= self.max_iterations * (1 + report.friction_updates):
                 left = f"{report.residual:.3g} N left on {report.where}"
                 report.reason = f"no equilibrium after {report.iterations} iterations: {left}"
-                return trial
+                break
             report.iterations += 1
             moved = self._iterate(system, increment, trial, energy, report)
             if moved is None:
-                return trial
+                break
             trial = moved
             energy = increment.gradient(trial)
             report.residual, report.where = system.residual()
+        return trial if best is None else self._accept(system, best, best_jump, report)
 
-    def _renew(
-        self, system: System, increment: EulerIncrement, trial: State, report: StepReport
-    ) -> tuple[float, float]:
-        """Renew what contact lags; return the residual it leaves [N] and the share of friction bounds that changed."""
-        change = system.contact.relag(trial)
-        report.friction_updates += 1
-        increment.gradient(trial)
-        report.residual, report.where = system.residual()
-        return report.residual, change
+    def _accept(self, system: System, best: State, jump: float, report: StepReport) -> State:
+        """End the step with the state that renewed contact disturbed least, by ``jump`` [N], if that is little.
 
-    def _settles(
-        self, system: System, trial: State, report: StepReport, *, jump: float, last_jump: float, change: float
-    ) -> bool:
-        """Say whether a balanced state ends the step: it stays balanced with renewed contact, or renewing leads no further.
-
-        In the latter case the contact geometry may jump between two faces; what is left must be small beside the
-        contact forces, else the step was too long.
+        Contact geometry can jump between two faces of a dent for ever, and friction bounds lag; what is left then must be
+        small beside the contact forces, else the step was too long.
         """
-        if system.contact.strain(trial) > 1.0:
-            report.reason = "edges slid too far over soft faces in one step"
-            return True
-        if jump > self.tolerance_N and change > self.friction_tolerance or jump > LAG_FORCE:
-            if report.friction_updates <= self.max_friction_updates and jump < LAG_PROGRESS * last_jump:
-                return False
+        system.contact.relag(best)
         bound = max(LAG_FORCE, LAG_SHARE * float(np.max(system.contact.relagged_forces, initial=0.0)))
-        report.converged = jump <= bound
+        report.converged, report.residual = jump <= bound, jump
         if not report.converged:
             report.reason = f"contact moved on too fast: {jump:.3g} N left on {report.where}"
-        return True
+        return best
 
     def _iterate(
         self, system: System, increment: EulerIncrement, trial: State, energy: float, report: StepReport
