@@ -20,29 +20,46 @@ from scipy.stats import qmc
 
 from finqd.design import Design, design_parameters
 from finqd.evaluate import evaluate
+from finqd.workers import TaskFailure, run_tasks
+
+
+def evaluate_one(task: tuple[int, list[float], list[str], str]) -> dict[str, Any]:
+    """Evaluate one design; return a row of the log."""
+    index, unit, objects, preset = task
+    begun = time.perf_counter()
+    design = Design.from_unit_vector(unit)
+    result = evaluate(design, objects=objects, preset=preset).to_dict()
+    kept = {key: result[key] for key in ("objects", "mesh", "status", "reason")}
+    return {"index": index, "vector": design.to_vector().tolist(), **kept, "seconds": time.perf_counter() - begun}
+
+
+def line(name: str, row: dict[str, Any]) -> str:
+    """Return one grasp in words."""
+    drop = "-" if row["drop_mm"] is None else f"{row['drop_mm']:.2f} mm"
+    return f"{name} {row['status']} {'held' if row['held'] else 'lost'} drop {drop}"
 
 
 def run(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Evaluate what the log does not hold yet; return all rows."""
     log = Path(arguments.log)
-    rows = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    rows = [json.loads(text) for text in log.read_text().splitlines()] if log.exists() else []
     done = {row["index"] for row in rows}
-    units = qmc.Sobol(len(design_parameters()), seed=arguments.seed).random(arguments.designs)
-    for index, unit in enumerate(units):
-        if index in done:
-            continue
-        begun = time.perf_counter()
-        design = Design.from_unit_vector(unit)
-        result = evaluate(design, objects=arguments.objects.split(","), preset=arguments.preset, jobs=arguments.jobs).to_dict()
-        row = {"index": index, "vector": design.to_vector().tolist(), "objects": result["objects"], "mesh": result["mesh"],
-               "status": result["status"], "reason": result["reason"], "seconds": time.perf_counter() - begun}
+    size = 2 ** math.ceil(math.log2(arguments.designs))  # Sobol points are balanced in powers of two
+    units = qmc.Sobol(len(design_parameters()), seed=arguments.seed).random(size)[: arguments.designs]
+    objects = arguments.objects.split(",")
+    tasks = [(i, unit.tolist(), objects, arguments.preset) for i, unit in enumerate(units) if i not in done]
+
+    def on_result(position: int, row: Any) -> None:
+        if isinstance(row, TaskFailure):
+            print(f"{tasks[position][0]:4d}  {row.kind}: {row.reason}", flush=True)
+            return
         rows.append(row)
         with log.open("a") as file:
             file.write(json.dumps(row) + "\n")
-        print(f"{index:4d}  {row['seconds']:6.1f} s  " + "  ".join(
-            f"{name} {o['status']} {'held' if o['held'] else 'lost'} drop {o['drop_mm'] if o['drop_mm'] is None else round(o['drop_mm'], 2)}"
-            for name, o in result["objects"].items()
-        ), flush=True)
+        grasps = "  ".join(line(*o) for o in row["objects"].items())
+        print(f"{row['index']:4d}  {row['seconds']:6.1f} s  {grasps}", flush=True)
+
+    run_tasks(evaluate_one, tasks, jobs=arguments.jobs, on_result=on_result)
     return rows
 
 
