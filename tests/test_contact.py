@@ -73,7 +73,7 @@ def direction(system: System, seed: int, *, shift: float, turn: float) -> Direct
 
 
 def contacting(system: System) -> State:
-    """Return a dented, sheared state: contact history begins in it a little away, so that some contacts stick and some slip."""
+    """Return a dented state, sheared a little since contact history began, so that some contacts stick and some slip."""
     start = system.initial_state().moved(direction(system, 1, shift=1e-5, turn=2e-4))
     system.contact.begin_step(start)
     shear = np.array([[4e-5, 2e-5, -1e-5, 1e-3, -1e-3, 2e-3]])
@@ -188,8 +188,9 @@ def test_moments_balance_without_friction() -> None:
     system = make("ball on soft", friction=0.0)
     state = contacting(system)
     soft, rigid = gradient(system, state)
-    torque = np.cross(state.positions, soft).sum(axis=0) + rigid[0, 3:] + np.cross(state.rigid_positions[0], rigid[0, :3])
-    assert np.abs(torque).max() < 1e-12 * np.abs(np.cross(state.positions, soft)).sum()
+    moments = np.cross(state.positions, soft)
+    torque = moments.sum(axis=0) + rigid[0, 3:] + np.cross(state.rigid_positions[0], rigid[0, :3])
+    assert np.abs(torque).max() < 1e-12 * np.abs(moments).sum()
 
 
 def test_features_and_samples_both_take_part() -> None:

@@ -1,0 +1,303 @@
+"""Kernels of contact, rotations and assembly, each alone, and the sparsity pattern that they write to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from finqd.mechanics import contact_kernels as kernels
+from finqd.mechanics.assembly_kernels import add_diagonal, hold, largest_force
+from finqd.mechanics.contact_surface import contact_surface, lattice
+from finqd.mechanics.material import Material
+from finqd.mechanics.pattern import BlockPattern
+from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_matrix, rotation_vector, skew
+from finqd.mesh_shapes import box_mesh
+from finqd.scene import Scene
+
+pytestmark = pytest.mark.kernel
+
+STIFFNESS, SMOOTHING = 2e5, 1e-5  # [N/m], [m]
+
+
+# -- the normal penalty ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("penetration", [0.2e-5, 0.9e-5, 1.1e-5, 5e-5])
+def test_normal_force_is_the_slope_of_its_energy(penetration: float) -> None:
+    h = 1e-9
+    force, slope = kernels.normal_force(-penetration, STIFFNESS, SMOOTHING)
+    energies = [kernels.normal_energy(-(penetration + s * h), STIFFNESS, SMOOTHING) for s in (-1, 1)]
+    forces = [kernels.normal_force(-(penetration + s * h), STIFFNESS, SMOOTHING)[0] for s in (-1, 1)]
+    assert force > 0.0
+    assert (energies[1] - energies[0]) / (2 * h) == pytest.approx(force, rel=1e-6)
+    assert (forces[1] - forces[0]) / (2 * h) == pytest.approx(slope, rel=1e-6)
+
+
+def test_normal_penalty_is_smooth_where_its_pieces_meet() -> None:
+    for edge in (0.0, SMOOTHING):
+        below, above = edge - 1e-15, edge + 1e-15
+        values = [
+            (kernels.normal_energy(-p, STIFFNESS, SMOOTHING), *kernels.normal_force(-p, STIFFNESS, SMOOTHING))
+            for p in (below, above)
+        ]
+        scale = (STIFFNESS * SMOOTHING**2, STIFFNESS * SMOOTHING, STIFFNESS)
+        assert np.all(np.abs(np.subtract(*values)) < 1e-8 * np.array(scale))
+    assert kernels.normal_energy(1e-9, STIFFNESS, SMOOTHING) == 0.0
+    deep = 1e-3
+    force, _ = kernels.normal_force(-deep, STIFFNESS, SMOOTHING)
+    assert force == pytest.approx(STIFFNESS * (deep - SMOOTHING / 2), rel=1e-12)
+
+
+def test_sides_that_look_away_do_not_push() -> None:
+    cosines = np.linspace(-1, 1, 2001)
+    shares = np.array([kernels.opposition(c) for c in cosines])
+    assert np.all(shares[cosines <= kernels.OPPOSED] == 0.0)
+    assert np.all(shares[cosines >= kernels.FULLY_OPPOSED] == 1.0)
+    assert np.all(np.diff(shares) >= 0.0) and np.diff(shares).max() < 0.01
+
+
+# -- friction ----------------------------------------------------------------------------------------------------------
+
+
+def friction_gradient(slip: np.ndarray, bound: float, stiffness: float) -> np.ndarray:
+    """Return the friction force on one soft vertex [N] through `add_friction`; its normal is z."""
+    gradient, rigid = np.zeros((1, 3)), np.zeros((0, 6))
+    kernels.add_friction(
+        np.array([[0]]), np.array([[[0]]]), np.array([0]), np.ones((1, 1)), slip[None], np.array([bound]),
+        np.array([stiffness]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)), np.array([-1]), np.zeros((0, 3, 3)), 1,
+        gradient, rigid, np.zeros((1, 3, 3)), np.zeros((3, 0)), np.zeros((0, 0)), True, False,
+    )
+    return gradient[0]
+
+
+@pytest.mark.parametrize("length", [0.3e-5, 0.95e-5, 1.05e-5, 8e-5])  # the cone is reached at 1e-5 m
+def test_friction_force_is_the_slope_of_its_energy(length: float) -> None:
+    stiffness, bound, h = 1e5, 1.0, 1e-9
+    slip = length * np.array([0.6, -0.8, 0.0])
+    force = friction_gradient(slip, bound, stiffness)
+    for i in range(2):
+        step = h * np.eye(3)[i]
+        bounds, springs = np.array([bound]), np.array([stiffness])
+        energies = [kernels.friction_energy((slip + s * step)[None], bounds, springs, 1) for s in (-1, 1)]
+        assert (energies[1] - energies[0]) / (2 * h) == pytest.approx(force[i], rel=1e-5)
+    assert np.linalg.norm(force) == pytest.approx(min(stiffness * length, bound), rel=1e-12)
+
+
+def test_return_mapping_shortens_to_the_cone_and_no_further() -> None:
+    slips = np.array([[3e-5, 4e-5, 0.0], [1e-6, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    before = slips.copy()
+    kernels.return_mapping(slips, np.array([1.0, 1.0, 0.0]), np.array([1e5, 1e5, 1e5]), 3)
+    assert np.allclose(slips[0], [0.6e-5, 0.8e-5, 0.0], rtol=1e-12)
+    assert np.array_equal(slips[1:], before[1:])
+    # what is left pulls with the force that the energy's slope gave before
+    assert np.allclose(1e5 * slips[0], friction_gradient(before[0], 1.0, 1e5), rtol=1e-12)
+
+
+def test_a_ball_that_rolls_does_not_slip() -> None:
+    radius, turn = 0.02, np.array([[0.0, 1e-3, 0.0]])
+    slips = np.empty((1, 3))
+    shift = np.array([[radius * turn[0, 1], 0.0, 0.0]])
+    kernels.elastic_slips(
+        np.zeros((0, 3)), shift, turn, np.zeros((0, 4), dtype=np.int64), np.array([-1]), np.zeros((1, 4)),
+        np.zeros((1, 3)), np.array([[0.0, 0.0, -radius]]), np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]),
+        np.array([0]), 1, slips,
+    )
+    assert np.abs(slips).max() < 1e-18
+
+
+# -- geometry ----------------------------------------------------------------------------------------------------------
+
+
+def test_closest_point_of_a_triangle_beats_all_others() -> None:
+    rng = np.random.default_rng(3)
+    grid = np.array([(i, j) for i in range(41) for j in range(41 - i)]) / 40
+    weights = np.column_stack([1 - grid.sum(axis=1), grid])
+    regions = set()
+    for _ in range(100):
+        corners, p, bary = rng.normal(size=(3, 3)), 1.5 * rng.normal(size=3), np.empty(3)
+        kernels.closest_on_triangle(p, *corners, bary)
+        assert np.isclose(bary.sum(), 1.0, atol=1e-12) and bary.min() >= -1e-12
+        distance = np.linalg.norm(p - bary @ corners)
+        brute = np.linalg.norm(p - weights @ corners, axis=1)
+        assert distance <= brute.min() + 1e-12
+        assert brute.min() - distance < 0.15  # on that grid something is near
+        regions.add(tuple(bary > 1e-12))
+    assert len(regions) == 7  # three corners, three edges, the inside
+
+
+def test_near_triangles_misses_none() -> None:
+    rng = np.random.default_rng(4)
+    positions, reach = rng.uniform(size=(60, 3)), 0.05
+    faces = rng.permutation(60).reshape(20, 3)
+    positions[faces[:, 1:]] = positions[faces[:, :1]] + 0.1 * rng.normal(size=(20, 2, 3))
+    points = rng.uniform(size=(80, 3))
+    pairs = np.empty((5000, 2), dtype=np.int64)
+    weight = np.tile(np.eye(3), (20, 1, 1))
+    count = kernels.near_triangles(
+        positions, faces, np.arange(20), points, reach, np.empty((20, 3)), np.empty((20, 3)), pairs
+    )
+    found = {(int(q), int(t)) for q, t in pairs[:count]}
+    assert len(found) == count <= len(pairs)
+    expected = set()
+    for q, p in enumerate(points):
+        for t in range(20):
+            bary = np.empty(3)
+            corners = weight[t] @ positions[faces[t]]
+            kernels.closest_on_triangle(p, *corners, bary)
+            if np.linalg.norm(p - bary @ corners) < reach:
+                expected.add((q, t))
+    assert expected and expected <= found
+    small = np.empty((1, 2), dtype=np.int64)
+    assert count == kernels.near_triangles(
+        positions, faces, np.arange(20), points, reach, np.empty((20, 3)), np.empty((20, 3)), small
+    )
+
+
+def test_plane_step_limit_stops_at_the_allowance() -> None:
+    heights, approach = np.array([1e-3, 5e-3, -1e-4]), np.array([2e-3, 1e-3, -1.0])
+    limit = kernels.plane_step_limit(heights, approach, 5e-4)
+    assert limit == pytest.approx(0.75)
+    assert np.all(heights[:2] - limit * approach[:2] >= -5e-4 - 1e-15)
+    assert kernels.plane_step_limit(heights, -approach[:1], 5e-4) == 1.0
+
+
+@pytest.mark.parametrize("kind", ["quad4", "quad8", "tri3", "tri6"])
+@pytest.mark.parametrize("cells", [(1, 1), (3, 2), (4, 5)])
+def test_lattice_covers_a_face_and_its_edges(kind: str, cells: tuple[int, int]) -> None:
+    points, share = lattice(kind, *cells)
+    assert len(points) == len(share) and np.all(share > 0.0)
+    assert share.sum() == pytest.approx(1.0, abs=1e-14)
+    if kind.startswith("quad"):
+        corners, centroid = [(-1, -1), (1, -1), (1, 1), (-1, 1)], (0.0, 0.0)
+    else:
+        corners, centroid = [(0, 0), (1, 0), (0, 1)], (1 / 3, 1 / 3)
+    for corner in corners:
+        assert np.min(np.linalg.norm(points - corner, axis=1)) < 1e-14
+    assert np.allclose(share @ points, centroid, atol=1e-14)  # linear pressures are integrated exactly
+
+
+def test_samples_stand_for_the_whole_surface_once() -> None:
+    for element in ("hex8", "wedge6", "tet4", "tet10"):
+        scene = Scene()
+        rubber = Material(youngs_modulus=1e6, poisson_ratio=0.45, density=1000.0)
+        body = scene.add_soft(box_mesh((0.02, 0.03, 0.01), (2, 3, 1), element), rubber)
+        body.fix("xmin")
+        surface = contact_surface(scene.soft_bodies, spacing=1.5e-3)
+        area = 2 * (0.02 * 0.03 + 0.02 * 0.01 + 0.03 * 0.01) - 0.03 * 0.01  # without the face that is held
+        assert surface.sample_area.sum() == pytest.approx(area, rel=1e-12)
+        assert np.allclose(surface.sample_weight.sum(axis=1), 1.0)
+        assert np.allclose(surface.triangle_weight.sum(axis=2), 1.0)
+
+
+# -- rotations ---------------------------------------------------------------------------------------------------------
+
+
+def vectors() -> list[np.ndarray]:
+    rng = np.random.default_rng(5)
+    axes = [a / np.linalg.norm(a) for a in rng.normal(size=(6, 3))] + [*np.eye(3), *-np.eye(3)]
+    angles = [1e-12, 1e-6, 0.99e-4, 1.01e-4, 0.1, 1.0, np.pi / 2, 3.0, np.pi - 1e-6, np.pi - 1e-9]
+    return [angle * axis for axis in axes for angle in angles]
+
+
+def test_rotation_vector_inverts_rotation_matrix() -> None:
+    for v in vectors():
+        r = rotation_matrix(v)
+        assert np.abs(r @ r.T - np.eye(3)).max() < 1e-14
+        assert np.linalg.det(r) == pytest.approx(1.0, abs=1e-14)
+        assert np.abs(rotation_vector(r) - v).max() < max(1e-14, 1e-12 * np.linalg.norm(v))
+    assert np.array_equal(rotation_vector(np.eye(3)), np.zeros(3))
+
+
+def test_half_turns_have_a_rotation_vector() -> None:
+    for axis in np.eye(3):
+        half = 2.0 * np.outer(axis, axis) - np.eye(3)
+        v = rotation_vector(half)
+        assert np.linalg.norm(v) == pytest.approx(np.pi, rel=1e-14)
+        assert np.abs(np.cross(v, axis)).max() < 1e-14
+
+
+def test_rotation_matrix_turns_by_the_right_hand() -> None:
+    turned = rotation_matrix(np.array([0.0, 0.0, np.pi / 2])) @ np.array([1.0, 0.0, 0.0])
+    assert np.allclose(turned, [0.0, 1.0, 0.0], atol=1e-15)
+    k, v, w = np.empty((3, 3)), np.array([1.0, 2.0, 3.0]), np.array([-0.3, 0.5, 0.2])
+    skew(v, k)
+    assert np.allclose(k @ w, np.cross(v, w), atol=1e-15)
+
+
+def test_inverse_left_jacobian_is_the_change_of_the_vector() -> None:
+    h = 1e-6
+    for v in [u for u in vectors() if np.linalg.norm(u) < 3.1] + [np.array([0.9e-3, 0, 0]), np.array([0, 1.1e-3, 0])]:
+        r, found = rotation_matrix(v), np.empty((3, 3))
+        for i in range(3):
+            step = h * np.eye(3)[i]
+            plus, minus = (rotation_vector(rotation_matrix(s * step) @ r) for s in (1, -1))
+            found[:, i] = (plus - minus) / (2 * h)
+        scale = 1.0 / (np.pi - np.linalg.norm(v)) ** 2  # differences lose digits near a half turn
+        assert np.abs(inverse_left_jacobian(v) - found).max() < 1e-8 * max(scale, 1.0)
+
+
+# -- assembly ----------------------------------------------------------------------------------------------------------
+
+
+CLIQUES = np.array([[0, 1, 2, -1], [2, 3, 4, 5], [5, 6, -1, -1]])
+
+
+def test_pattern_holds_exactly_the_pairs_of_its_cliques() -> None:
+    pattern = BlockPattern.from_cliques(8, [CLIQUES])
+    expected = np.eye(8, dtype=bool)  # vertex 7 belongs to nothing, and still has its diagonal
+    for clique in CLIQUES:
+        nodes = clique[clique >= 0]
+        expected[np.ix_(nodes, nodes)] = True
+    dense = pattern.matrix(np.ones((pattern.n_blocks, 3, 3))).toarray()[::3, ::3] > 0
+    assert np.array_equal(dense, expected)
+    assert pattern.n_blocks == expected.sum()
+
+
+def test_slots_scatter_to_rows_and_columns_of_their_vertices() -> None:
+    pattern = BlockPattern.from_cliques(8, [CLIQUES])
+    slots = pattern.slots(CLIQUES)
+    blocks, expected = np.zeros((pattern.n_blocks, 3, 3)), np.zeros((24, 24))
+    rng = np.random.default_rng(6)
+    for e, clique in enumerate(CLIQUES):
+        for i, a in enumerate(clique):
+            for j, b in enumerate(clique):
+                if a < 0 or b < 0:
+                    assert slots[e, i, j] == -1
+                    continue
+                block = rng.normal(size=(3, 3))
+                blocks[slots[e, i, j]] += block
+                expected[3 * a : 3 * a + 3, 3 * b : 3 * b + 3] += block
+    assert np.allclose(pattern.matrix(blocks).toarray(), expected, atol=1e-15)
+    with pytest.raises(KeyError):
+        pattern.slots(np.array([[0, 6]]))
+
+
+def test_held_unknowns_become_rows_of_the_identity() -> None:
+    pattern = BlockPattern.from_cliques(8, [CLIQUES])
+    rng = np.random.default_rng(7)
+    blocks, coupling = rng.normal(size=(pattern.n_blocks, 3, 3)), rng.normal(size=(24, 6))
+    fixed = np.zeros((8, 3), dtype=bool)
+    fixed[2], fixed[5, 1], fixed[7, 0] = True, True, True
+    expected, expected_coupling = pattern.matrix(blocks.copy()).toarray(), coupling.copy()
+    held = fixed.ravel()
+    expected[held], expected[:, held] = 0.0, 0.0
+    expected[held, held] = 1.0
+    expected_coupling[held] = 0.0
+    hold(pattern.indptr, pattern.indices, fixed, blocks, coupling)
+    assert np.array_equal(pattern.matrix(blocks).toarray(), expected)
+    assert np.array_equal(coupling, expected_coupling)
+
+
+def test_diagonal_and_largest_force() -> None:
+    pattern = BlockPattern.from_cliques(8, [CLIQUES])
+    blocks = np.zeros((pattern.n_blocks, 3, 3))
+    add_diagonal(pattern.indptr, pattern.indices, np.arange(8.0), blocks)
+    assert np.array_equal(pattern.matrix(blocks).toarray(), np.diag(np.repeat(np.arange(8.0), 3)))
+    forces, fixed = np.zeros((4, 3)), np.zeros((4, 3), dtype=bool)
+    forces[1], forces[2] = (3.0, 4.0, 0.0), (100.0, 0.0, 1.0)
+    fixed[2, 0] = True
+    assert largest_force(forces, fixed) == (5.0, 1)
+    forces[3, 2] = np.nan
+    size, where = largest_force(forces, fixed)
+    assert np.isnan(size) and where == 3
+    assert largest_force(np.zeros((0, 3)), np.zeros((0, 3), dtype=bool))[1] == -1
