@@ -73,7 +73,7 @@ def direction(system: System, seed: int, *, shift: float, turn: float) -> Direct
 
 
 def contacting(system: System) -> State:
-    """Return a dented state, sheared a little since contact history began, so that some contacts stick and some slip."""
+    """Return a dented state, sheared a little since contact history began, so that some contacts stick, some slip."""
     start = system.initial_state().moved(direction(system, 1, shift=1e-5, turn=2e-4))
     system.contact.begin_step(start)
     shear = np.array([[4e-5, 2e-5, -1e-5, 1e-3, -1e-3, 2e-3]])
