@@ -24,8 +24,9 @@ from typing import Any
 def run_once(arguments: argparse.Namespace, folder: Path, *, name: str, jobs: int) -> tuple[float, dict[str, Any]]:
     """Run ``finqd evaluate`` in a process of its own; return wall seconds and the result."""
     out = folder / f"{name}.json"
-    command = [sys.executable, "-m", "finqd", "evaluate", arguments.design, "--preset", arguments.preset, "--jobs", str(jobs)]
-    command += ["--quiet", "--out", str(out)] + (["--objects", arguments.objects] if arguments.objects else [])
+    command = [sys.executable, "-m", "finqd", "evaluate", arguments.design, "--preset", arguments.preset]
+    command += ["--jobs", str(jobs), "--quiet", "--out", str(out)]
+    command += ["--objects", arguments.objects] if arguments.objects else []
     begun = time.perf_counter()
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
     subprocess.run(command, check=True, env=environment, stderr=subprocess.DEVNULL)

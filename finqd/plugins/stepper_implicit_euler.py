@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ class ImplicitEuler:
     """First order implicit Euler: every step minimises inertia plus elasticity, contact and friction by Newton's method.
 
     tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step
-    max_iterations: Newton iterations after which a step is given up (and halved)
+    max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal
     max_friction_updates: how often the friction bounds are renewed within a step
     friction_tolerance: share of the friction bounds that may change without a renewal
     linear_solver, preconditioner, backend: see `finqd.mechanics.linear`
@@ -36,7 +36,7 @@ class ImplicitEuler:
     """
 
     tolerance_N: Annotated[float, Gt(0), Le(1)] = 5e-5
-    max_iterations: Annotated[int, Ge(1), Le(1000)] = 40
+    max_iterations: Annotated[int, Ge(1), Le(1000)] = 25
     max_friction_updates: Annotated[int, Ge(0), Le(100)] = 3
     friction_tolerance: Annotated[float, Gt(0), Le(1)] = 0.02
     linear_solver: Literal["cg", "direct"] = "cg"
@@ -161,8 +161,3 @@ class ImplicitEuler:
             best = -0.5 * slope * share * share / curvature if np.isfinite(curvature) and curvature > 0.0 else 0.0
             share = min(max(best, 0.1 * share), 0.5 * share)
         return None
-
-
-def without_damping(stepper: ImplicitEuler) -> ImplicitEuler:
-    """Return the stepper with the tightest tolerance that double precision carries, for conservation laws."""
-    return replace(stepper, tolerance_N=1e-10, linear_tolerance=1e-12)
