@@ -20,7 +20,7 @@ EFFECTS = {
 ASSUMPTIONS = (
     "object sizes, density, friction, time step, stroke, lift and hold time are finqd's choices: the paper gives none",
     "finger profile: isosceles triangle, walls measured perpendicular, base plate 2 mm, ribs clipped by the cavity",
-    "the mount's volume is a 2.75 mm plate over the workspace triangle, chosen so that the paper's benchmark volume results",
+    "the mount's volume is a 2.75 mm plate over the workspace triangle, chosen to give the paper's benchmark volume",
     "the mount is rigid: each finger base is driven as a whole",
     "each finger's drive stalls by itself when the sum of the normal contact forces on that finger reaches its limit",
     "the object starts at rest on the floor, centred under the gripper",

@@ -137,7 +137,8 @@ def load_objects(objects: Sequence[str | Path | GraspObject] | None) -> list[Gra
     names = [g.name for g in grasped]
     repeated = {name for name in names if names.count(name) > 1}
     if repeated or not names:
-        raise InputError(f"each object once, please: {', '.join(sorted(repeated))}" if repeated else "no object", "objects")
+        message = f"each object once, please: {', '.join(sorted(repeated))}" if repeated else "no object"
+        raise InputError(message, "objects")
     return grasped
 
 
@@ -154,10 +155,12 @@ def finger_meshes(design: Design, solids: Sequence[Solid]) -> tuple[Mesh, ...]:
 
 def describe_meshes(meshes: Sequence[Mesh], design: Design) -> dict[str, Any]:
     """Return what a result says of its meshes."""
+    kinds = sorted({kind for mesh in meshes for kind in mesh.blocks})
     return {
-        "elements": {kind: sum(len(m.blocks.get(kind, ())) for m in meshes) for kind in sorted({k for m in meshes for k in m.blocks})},
+        "elements": {kind: sum(len(mesh.blocks.get(kind, ())) for mesh in meshes) for kind in kinds},
         "vertices": sum(m.n_vertices for m in meshes), "dofs": 3 * sum(m.n_vertices for m in meshes),
-        "volume_mm3": sum(m.volume for m in meshes) / MM**3, "base_height_mm": base_height(meshes, design.protocol) / MM,
+        "volume_mm3": sum(m.volume for m in meshes) / MM**3,
+        "base_height_mm": base_height(meshes, design.protocol) / MM,
     }
 
 

@@ -48,7 +48,7 @@ def grasp_duration(protocol: GraspProtocol) -> float:
 
 
 def base_height(meshes: Sequence[Mesh], protocol: GraspProtocol) -> float:
-    """Return the height [m] of the finger bases over the floor: the longest finger's tip clears it as the protocol says."""
+    """Return the height [m] of the finger bases over the floor: the longest finger clears it as the protocol says."""
     return max(float(mesh.vertices[:, 1].max()) for mesh in meshes) + protocol.si("tip_clearance_mm")
 
 
@@ -59,9 +59,8 @@ def grasp_scene(task: GraspTask) -> tuple[Scene, RigidBody]:
     height = base_height(task.meshes, protocol)
     count = len(task.meshes)
     placements = [placement(i, count, design.spacing, height) for i in range(count)]
-    lift = Timed(
-        path=Shift(vector=(0.0, 0.0, protocol.si("lift_mm"))), start=lift_start(protocol), duration=protocol.si("lift_s")
-    )
+    rise = Shift(vector=(0.0, 0.0, protocol.si("lift_mm")))
+    lift = Timed(path=rise, start=lift_start(protocol), duration=protocol.si("lift_s"))
     elasticity = design.plugin("elasticity")
     motions = design.plugin("actuation").motions(placements)
     for i, (mesh, pose, motion) in enumerate(zip(task.meshes, placements, motions, strict=True)):
@@ -101,9 +100,9 @@ def simulate_grasp(task: GraspTask, *, progress: Callable[[float], None] | None 
             object_name=task.grasped.name, protocol=protocol,
         )
     trajectory = simulate(
-        scene, duration=grasp_duration(protocol), time_step=protocol.time_step_ms * MS, stepper=design.plugin("stepper"),
-        contact=design.plugin("contact"), record=task.record, wall_clock_limit=protocol.si("wall_clock_limit_s"),
-        progress=progress,
+        scene, duration=grasp_duration(protocol), time_step=protocol.time_step_ms * MS,
+        stepper=design.plugin("stepper"), contact=design.plugin("contact"), record=task.record,
+        wall_clock_limit=protocol.si("wall_clock_limit_s"), progress=progress,
     )
     return replace(
         trajectory, object_name=task.grasped.name, protocol=protocol, object_drop=object_drop(trajectory, protocol)

@@ -161,7 +161,10 @@ class SoftBody:
 
 @dataclass(kw_only=True, eq=False)
 class RigidBody:
-    """A rigid body of a `Scene`: ``shape`` carries mass, inertia, surface and distance; the pose is of the centre of mass."""
+    """A rigid body of a `Scene`; the pose is that of its centre of mass.
+
+    ``shape`` carries mass, inertia, surface and distance.
+    """
 
     name: str
     shape: GraspObject

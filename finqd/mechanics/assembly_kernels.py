@@ -39,7 +39,7 @@ def hold(indptr, indices, fixed, blocks, coupling):
 
 @njit(cache=True)
 def largest_force(gradient, fixed):
-    """Return the largest force [N] on a vertex, without fixed degrees of freedom, and that vertex (-1 if there is none)."""
+    """Return the largest force [N] on a vertex, without fixed degrees of freedom, and that vertex (-1 if none)."""
     best, where = 0.0, -1
     for i in range(gradient.shape[0]):
         f = 0.0

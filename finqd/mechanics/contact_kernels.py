@@ -123,14 +123,14 @@ def face_normals(positions, faces, corners, normals):
 @njit(cache=True)
 def find_soft_rigid(
     positions, faces, normals, first_sample, sample_weight, sample_stiffness, centre, rotation, field, low, high,
-    radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
-    count,
+    radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid,
+    out_turns, out_curve, count,
 ):
     """Append the samples of soft faces that lie inside a rigid body; return the new count.
 
-    low, high: bounding box of the body in its own frame, shape (3,); radius: of its bounding ball [m]; normals: unit normals of the
-    faces, shape (n_faces, 3). A sample acts as far as its
-    face looks towards the body's surface (`opposition`).
+    low, high: bounding box of the body in its own frame, shape (3,); radius: of its bounding ball [m]; normals: unit
+    normals of the faces, shape (n_faces, 3). A sample acts as far as its face looks towards the body's surface
+    (`opposition`).
     """
     x, y, m = np.empty(3), np.empty(3), np.empty(3)
     face_low, face_high = np.empty(3), np.empty(3)
@@ -255,7 +255,10 @@ def find_rigid_plane(
 
 @njit(cache=True)
 def closest_on_triangle(p, a, b, c, bary):
-    """Write barycentric coordinates of the point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 5.1.5)."""
+    """Write barycentric coordinates of the point of triangle abc closest to p.
+
+    Source: Ericson, Real-Time Collision Detection, 2005, section 5.1.5.
+    """
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
     bary[0], bary[1], bary[2] = 1.0, 0.0, 0.0
@@ -347,7 +350,7 @@ def _triangle(positions, faces, triangle_face, triangle_weight, t, corner, norma
 
 @njit(cache=True)
 def _write_plane(row, q, t, bary, normal, triangle_face, triangle_weight, out_point, out_face, out_weight, out_normal):
-    """Write the plane through the point ``bary`` of triangle ``t`` for feature ``q``; the normal is written reversed."""
+    """Write the plane through the point ``bary`` of triangle ``t`` for feature ``q``, the normal reversed."""
     out_point[row] = q
     out_face[row] = triangle_face[t]
     for a in range(out_weight.shape[1]):
@@ -360,9 +363,10 @@ def _write_plane(row, q, t, bary, normal, triangle_face, triangle_weight, out_po
 
 @njit(cache=True)
 def _nearest_triangle(p, positions, faces, triangle_face, triangle_weight, pairs, i0, i1, distance):
-    """Return the triangle of pairs i0 to i1 nearest to ``p``, and the signed distance; fill ``distance`` for each pair [m].
+    """Return the triangle of pairs i0 to i1 nearest to ``p``, and the signed distance [m].
 
-    Where several are equally near (an edge), the one that faces the point most is taken.
+    Fills ``distance`` for each pair [m]. Where several are equally near (an edge), the one that faces the point most is
+    taken.
     """
     corner, n, bary = np.empty((3, 3)), np.empty(3), np.empty(3)
     best, best_facing, best_pair, gap = np.inf, -1.0, i0, 0.0
@@ -387,8 +391,8 @@ def pair_features(
 ):
     """Write the planes that the features of a rigid body meet on a soft body; return how many.
 
-    pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); outward: unit pseudonormals of the
-    features, body frame, shape (n_points, 3). Each point within ``reach`` [m] outside and ``depth`` inside (deeper
+    pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); outward: unit pseudonormals of
+    the features, body frame, shape (n_points, 3). Each point within ``reach`` [m] outside and ``depth`` inside (deeper
     ones are nearer to the wall's other side) gets the plane of the nearest triangle, or, outside beyond a convex
     edge, the plane across the direction of the distance. In a dent it gets the planes of the other triangles within
     ``near`` [m] as well, as far as they rise over the first: it cannot be in balance on one side of a crease alone.
@@ -420,7 +424,8 @@ def pair_features(
             for j in range(3):
                 facing_out -= n[i] * rotation[i, j] * outward[q, j]
         _write_plane(
-            count, q, pairs[nearest, 1], bary, n, triangle_face, triangle_weight, out_point, out_face, out_weight, out_normal
+            count, q, pairs[nearest, 1], bary, n, triangle_face, triangle_weight, out_point, out_face, out_weight,
+            out_normal,
         )
         out_share[count] = opposition(facing_out)
         count += 1
@@ -433,7 +438,8 @@ def pair_features(
                 continue
             closest_on_triangle(p, corner[0], corner[1], corner[2], bary)
             _write_plane(
-                count, q, pairs[c, 1], bary, other, triangle_face, triangle_weight, out_point, out_face, out_weight, out_normal
+                count, q, pairs[c, 1], bary, other, triangle_face, triangle_weight, out_point, out_face, out_weight,
+                out_normal,
             )
             out_share[count] = out_share[count - 1]
             count += 1
@@ -443,10 +449,10 @@ def pair_features(
 @njit(cache=True)
 def find_feature_plane(
     positions, faces, plane_point, plane_face, plane_weight, plane_normal, plane_stiffness, points, centre, rotation,
-    rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
-    count,
+    rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns,
+    out_curve, count,
 ):
-    """Append the features of a rigid body below the tangent planes that `pair_features` gave them; return the new count."""
+    """Append the features of a rigid body below the planes that `pair_features` gave them; return the new count."""
     x, arm = np.empty(3), np.empty(3)
     for c in range(plane_point.shape[0]):
         q = plane_point[c]
@@ -538,8 +544,9 @@ def _add_row(
 def _add_turning(faces, face, weight, rigid, turns, force, normal, arm, coupling, rigid_matrix):
     r"""Add what the turning of a rigid body does to a contact's Hessian at the normal force ``force`` [N].
 
-    With the spin v and the motion u of the soft point relative to the centre of mass, the gap n . (x - c) changes in second
-    order by n . (v x (v x r)) / 2 - n . (v x u) if the normal turns along, and by -n . (v x (v x r)) / 2 if it stays.
+    With the spin v and the motion u of the soft point relative to the centre of mass, the gap n . (x - c) changes in
+    second order by n . (v x (v x r)) / 2 - n . (v x u) if the normal turns along, and by -n . (v x (v x r)) / 2 if it
+    stays.
     """
     r0 = 6 * rigid
     along = normal[0] * arm[0] + normal[1] * arm[1] + normal[2] * arm[2]
@@ -574,8 +581,8 @@ def add_normal(
 ):
     """Add gradient and Hessian of the penalty, as wanted; return the energy [J].
 
-    ``exact``: with the terms of the gap's second derivative (curvature, and turning of the rigid body), without which the
-    Hessian is Gauss-Newton's and positive semidefinite.
+    ``exact``: with the terms of the gap's second derivative (curvature, and turning of the rigid body), without which
+    the Hessian is Gauss-Newton's and positive semidefinite.
     """
     energy = 0.0
     spin, matrix, force = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
@@ -604,7 +611,8 @@ def add_normal(
 
 @njit(cache=True)
 def elastic_slips(
-    positions, rigid_shift, rigid_turn, faces, face, weight, start_point, start_arm, start_slip, normal, rigid, count, slips
+    positions, rigid_shift, rigid_turn, faces, face, weight, start_point, start_arm, start_slip, normal, rigid, count,
+    slips,
 ):
     """Write the trial elastic slip [m] of each frictional contact: tangential part of start_slip + relative motion.
 
@@ -636,8 +644,8 @@ def elastic_slips(
 def friction_energy(slips, bound, stiffness, count):
     r"""Return the Huber potential [J] of Coulomb friction at fixed bounds mu N [N].
 
-    k |s|^2/2 inside the cone (k |s| <= mu N), mu N |s| - (mu N)^2/(2 k) outside (the return mapping's potential; Simo and
-    Hughes, Computational Inelasticity, 1998, ch. 2, for the plastic analogue).
+    k |s|^2/2 inside the cone (k |s| <= mu N), mu N |s| - (mu N)^2/(2 k) outside (the return mapping's potential; Simo
+    and Hughes, Computational Inelasticity, 1998, ch. 2, for the plastic analogue).
     """
     energy = 0.0
     for c in range(count):

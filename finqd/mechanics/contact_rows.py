@@ -54,7 +54,7 @@ class FeaturePlanes:
 
 
 class Rows:
-    """Contacts at one state: ``count`` of at most ``capacity`` rows are in use; see `contact_kernels` for the columns."""
+    """Contacts at one state: ``count`` of at most ``capacity`` rows are in use; columns as in `contact_kernels`."""
 
     def __init__(self, capacity: int, width: int) -> None:
         self.count = 0

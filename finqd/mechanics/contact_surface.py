@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -65,9 +64,10 @@ _TRIANGLES["quad8"] = [
 
 
 def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return local points (p, 2) of a lattice with n by m cells (n by n for a triangle) and their area shares, summing to 1.
+    """Return local points (p, 2) of a lattice with n by m cells (n by n for a triangle) and their shares of the area.
 
-    The lattice includes the face's edges, since a face's rim is what touches first; the shares are the trapezoidal rule's.
+    The lattice includes the face's edges, since a face's rim is what touches first; the shares are the trapezoidal
+    rule's and sum to 1.
     """
     if face_type.startswith("quad"):
         u, v = np.linspace(-1, 1, n + 1), np.linspace(-1, 1, m + 1)
@@ -134,7 +134,7 @@ def _samples(
 
 
 def _merged(parts: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge samples of one body that coincide at rest (to a nanometre) on faces of like direction, adding their areas."""
+    """Merge samples of one body that coincide at rest (to 1 nm) on faces of like direction, adding their areas."""
     face, weight, area, position, normal = parts
     key = np.concatenate([np.round(position, 9), np.round(2.0 * normal)], axis=1)
     _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
@@ -160,7 +160,8 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
             face_body.append(np.full(len(block), number))
             face_corners.append(np.full(len(block), 4 if kind.startswith("quad") else 3))
             parts.append(_samples(body.mesh.vertices[block], kind, first_face, spacing, width))
-            corners = face_shape(kind, np.array(_TRIANGLES[kind], dtype=float).reshape(-1, 2)).reshape(-1, 3, block.shape[1])
+            local = np.array(_TRIANGLES[kind], dtype=float).reshape(-1, 2)
+            corners = face_shape(kind, local).reshape(-1, 3, block.shape[1])
             weight = np.zeros((len(block) * len(corners), 3, width))
             weight[:, :, : block.shape[1]] = np.tile(corners, (len(block), 1, 1))
             triangles.append((np.repeat(np.arange(len(block)) + first_face, len(corners)), weight))
@@ -181,6 +182,7 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
     triangle_face, triangle_weight = (np.concatenate(p) for p in zip(*triangles, strict=True))
     return ContactSurface(
         faces=np.concatenate(faces), face_body=np.concatenate(face_body), face_corners=np.concatenate(face_corners),
-        first_sample=np.searchsorted(sample_face, np.arange(first_face + 1)), sample_face=sample_face, sample_weight=sample_weight, sample_area=sample_area,
-        triangle_face=triangle_face, triangle_weight=triangle_weight,
+        first_sample=np.searchsorted(sample_face, np.arange(first_face + 1)), sample_face=sample_face,
+        sample_weight=sample_weight, sample_area=sample_area, triangle_face=triangle_face,
+        triangle_weight=triangle_weight,
     )

@@ -63,7 +63,8 @@ class EulerIncrement:
         soft = np.vdot(self.vertex_weight, (state.positions - self.inertial) ** 2)
         shift = state.rigid_positions - self.rigid_inertial
         off = turns - self.spins
-        rigid = np.vdot(self.system.rigid_masses, np.sum(shift**2, axis=1)) + np.einsum("bi,bij,bj", off, self.inertias, off)
+        rigid = np.vdot(self.system.rigid_masses, np.sum(shift**2, axis=1))
+        rigid += np.einsum("bi,bij,bj", off, self.inertias, off)
         return 0.5 * soft + 0.5 * rigid / self.dt**2
 
     def energy(self, state: State) -> float:

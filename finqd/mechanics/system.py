@@ -112,7 +112,9 @@ class System:
         forces = self.contact.soft_forces
         return np.array(
             [
-                motion.advanced(state.progress[i], time=state.time, dt=dt, force=forces[self.scene.soft_bodies.index(body)])
+                motion.advanced(
+                    state.progress[i], time=state.time, dt=dt, force=forces[self.scene.soft_bodies.index(body)]
+                )
                 for i, (body, _, motion) in enumerate(self.scene.motions)
             ]
         )
@@ -154,7 +156,10 @@ class System:
         hold(self.pattern.indptr, self.pattern.indices, self.fixed, d.blocks, d.coupling)
 
     def residual(self) -> tuple[float, str]:
-        """Return the largest unbalanced force in `derivatives` [N] and what it acts on; a torque counts over the body's size."""
+        """Return the largest unbalanced force in `derivatives` [N] and what it acts on.
+
+        A torque counts as a force on a lever of the body's size.
+        """
         d = self.derivatives
         best, vertex = largest_force(d.soft, self.fixed)
         where = self._vertex_name(vertex) if vertex >= 0 else ""

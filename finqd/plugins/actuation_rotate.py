@@ -17,8 +17,8 @@ from finqd.units import DEG
 class Rotate:
     """Turns each finger towards the axis about the inner edge of its base, eased, and stalls at a contact force.
 
-    angle_deg: stroke; duration_s: of the unhindered stroke; force_limit_N: sum of the normal contact forces on one finger
-    at which its drive stalls (a drive slows down linearly over the last fifth before it, and never runs back)
+    angle_deg: stroke; duration_s: of the unhindered stroke; force_limit_N: sum of the normal contact forces on one
+    finger at which its drive stalls (a drive slows down linearly over the last fifth before it, and never runs back)
     """
 
     angle_deg: Annotated[float, Ge(-90), Le(90)] = 30.0

@@ -69,7 +69,8 @@ class PenaltyContact:
         self.sample_stiffness = stiffness * self.surface.sample_area
         shapes = [body.shape for body in scene.rigid_bodies]
         self.feature_stiffness = [
-            stiffness * FEATURE_WIDTH * np.where(s.feature_lengths > 0.0, s.feature_lengths, CORNER_LENGTH) for s in shapes
+            stiffness * FEATURE_WIDTH * np.where(s.feature_lengths > 0.0, s.feature_lengths, CORNER_LENGTH)
+            for s in shapes
         ]
         self.feature_normals = [_outward(s) for s in shapes]
         # under weightless conditions a body still must not sink into a plane: 1 g stands in for gravity
@@ -135,7 +136,7 @@ class PenaltyContact:
         self.relag(state)
 
     def relag(self, state: State) -> float:
-        """Renew the friction bounds at ``state``; return which share of them, in sum, has changed since the last time."""
+        """Renew the friction bounds at ``state``; return which share of them, in sum, has changed since last time."""
         self._hold_geometry(state)
         self._find(state)
         bounds = np.zeros(self.n_keys)
@@ -169,7 +170,7 @@ class PenaltyContact:
         return energy + kernels.friction_energy(slips, self.friction.bound, self.friction.stiffness, len(slips))
 
     def add_hessian(self, state: State, derivatives: Derivatives, *, projected: bool = False) -> None:
-        """Add the Hessian; ``projected``: a positive semidefinite one, exact for friction, Gauss-Newton for the penalty."""
+        """Add the Hessian; ``projected``: a semidefinite one, exact for friction, Gauss-Newton for the penalty."""
         self._add(state, derivatives, gradient=False, exact=not projected)
 
     def _add(
@@ -195,7 +196,8 @@ class PenaltyContact:
         surface, limit = self.surface, 1.0
         farthest = float(np.sqrt(np.max(np.sum(direction.soft**2, axis=1), initial=0.0)))
         for r, body in enumerate(self.scene.rigid_bodies):
-            move = np.linalg.norm(direction.rigid[r, :3]) + np.linalg.norm(direction.rigid[r, 3:]) * body.shape.bounding_radius
+            shift, turn = np.linalg.norm(direction.rigid[r, :3]), np.linalg.norm(direction.rigid[r, 3:])
+            move = shift + turn * body.shape.bounding_radius
             if farthest + move <= allowance:
                 continue
             limit = min(
@@ -264,8 +266,8 @@ class PenaltyContact:
         slips = np.empty((len(f.key), 3))
         shift = state.rigid_positions - start.rigid_positions
         kernels.elastic_slips(
-            state.positions, shift, self._turns(state), self.surface.faces, f.face, f.weight, f.start_point, f.start_arm,
-            f.start_slip, f.normal, f.rigid, len(slips), slips,
+            state.positions, shift, self._turns(state), self.surface.faces, f.face, f.weight, f.start_point,
+            f.start_arm, f.start_slip, f.normal, f.rigid, len(slips), slips,
         )
         return slips
 
@@ -293,8 +295,8 @@ class PenaltyContact:
         for r, body in enumerate(scene.rigid_bodies):
             pose = (np.ascontiguousarray(state.rigid_positions[r]), np.ascontiguousarray(state.rigid_rotations[r]))
             rows.count = kernels.find_soft_rigid(
-                state.positions, *samples, *pose, body.shape.distance, *self.boxes[r], float(body.shape.bounding_radius), r,
-                self.first_key["rigid", r], *rows.arrays, rows.count,
+                state.positions, *samples, *pose, body.shape.distance, *self.boxes[r],
+                float(body.shape.bounding_radius), r, self.first_key["rigid", r], *rows.arrays, rows.count,
             )
             for b, planes in enumerate(self.planes[r]):
                 rows.count = kernels.find_feature_plane(
@@ -309,7 +311,8 @@ class PenaltyContact:
                 )
         for p, plane in enumerate(scene.planes):
             rows.count = kernels.find_soft_plane(
-                state.positions, *samples, plane.point, plane.normal, self.first_key["plane", p], *rows.arrays, rows.count,
+                state.positions, *samples, plane.point, plane.normal, self.first_key["plane", p], *rows.arrays,
+                rows.count,
             )
         self.last_rows_state = state
 
@@ -317,7 +320,8 @@ class PenaltyContact:
         """Fix what would make Newton's method stumble from face to face: the planes that features meet."""
         self._renew_pairs(state)
         self.planes = [
-            [self._feature_planes(r, body, pairs, state) for body, pairs in enumerate(self._pairs[r])] for r in range(len(self.scene.rigid_bodies))
+            [self._feature_planes(r, body, pairs, state) for body, pairs in enumerate(self._pairs[r])]
+            for r in range(len(self.scene.rigid_bodies))
         ]
         self.last_rows_state = None
 
@@ -366,7 +370,8 @@ class PenaltyContact:
         pairs = np.empty((4096, 2), dtype=np.int64)
         while True:
             count = kernels.near_triangles(
-                state.positions, surface.faces, surface.triangle_face, points, FEATURE_REACH, scratch[0], scratch[1], pairs
+                state.positions, surface.faces, surface.triangle_face, points, FEATURE_REACH, scratch[0], scratch[1],
+                pairs,
             )
             if count <= len(pairs):
                 break

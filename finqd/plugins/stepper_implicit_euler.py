@@ -24,7 +24,7 @@ ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search 
 
 @dataclass(frozen=True, kw_only=True)
 class ImplicitEuler:
-    """First order implicit Euler: every step minimises inertia plus elasticity, contact and friction by Newton's method.
+    """First order implicit Euler: every step minimises inertia, elasticity, contact and friction by Newton's method.
 
     tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step
     max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal
@@ -81,7 +81,8 @@ class ImplicitEuler:
                 progress = report.residual < LAG_PROGRESS * best_jump
                 if done and report.residual < best_jump:
                     best, best_jump = trial, report.residual
-                still = report.residual <= self.tolerance_N or change <= self.friction_tolerance and report.residual <= LAG_FORCE
+                steady = change <= self.friction_tolerance and report.residual <= LAG_FORCE
+                still = report.residual <= self.tolerance_N or steady
                 if done and (still or not progress or report.friction_updates > self.max_friction_updates):
                     break
                 continue
@@ -101,8 +102,8 @@ class ImplicitEuler:
     def _accept(self, system: System, best: State, jump: float, report: StepReport) -> State:
         """End the step with the state that renewed contact disturbed least, by ``jump`` [N], if that is little.
 
-        Contact geometry can jump between two faces of a dent for ever, and friction bounds lag; what is left then must be
-        small beside the contact forces, else the step was too long.
+        Contact geometry can jump between two faces of a dent for ever, and friction bounds lag; what is left then must
+        be small beside the contact forces, else the step was too long.
         """
         system.contact.relag(best)
         bound = max(LAG_FORCE, LAG_SHARE * float(np.max(system.contact.relagged_forces, initial=0.0)))
@@ -145,8 +146,8 @@ class ImplicitEuler:
         return solution
 
     def _search(
-        self, system: System, increment: EulerIncrement, trial: State, energy: float, direction: Direction, slope: float,
-        report: StepReport,
+        self, system: System, increment: EulerIncrement, trial: State, energy: float, direction: Direction,
+        slope: float, report: StepReport,
     ) -> State | None:
         """Backtrack until Armijo's condition holds, by the parabola through both energies and the slope."""
         share = system.contact.step_limit(trial, direction)
