@@ -14,7 +14,7 @@ import scipy.sparse as sp
 
 @dataclass(frozen=True)
 class BlockPattern:
-    """Block rows: ``indptr`` (n_vertices + 1,), ``indices`` (n_blocks,): each block's column vertex, sorted in a row."""
+    """Block rows: ``indptr`` (n_vertices + 1,), ``indices`` (n_blocks,): column vertex of a block, sorted in a row."""
 
     indptr: np.ndarray
     indices: np.ndarray
