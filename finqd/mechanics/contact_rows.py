@@ -78,7 +78,7 @@ class Rows:
         )
 
     def forces(self, smoothing: float) -> np.ndarray:
-        """Return the normal forces [N], shape (count,); see `contact_kernels.normal_force`."""
+        """Return the normal forces [N], shape (count,); see `contact_force_kernels.normal_force`."""
         depth, stiffness = -self.gap[: self.count], self.stiffness[: self.count]
         return stiffness * np.where(depth < smoothing, depth**2 / (2.0 * smoothing), depth - 0.5 * smoothing)
 

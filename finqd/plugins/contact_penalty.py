@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Gt, Le
 
+from finqd.mechanics import contact_force_kernels as forces
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.contact_rows import FeaturePlanes, FrictionRows, Rows
 from finqd.mechanics.contact_surface import contact_surface
@@ -160,14 +161,14 @@ class PenaltyContact:
         self._find(state)
         smoothing = self.options.smoothing_mm * MM
         rows, friction = self.rows, self.friction
-        energy = kernels.normal_contacts_energy(rows.gap, rows.stiffness, smoothing, rows.count)
+        energy = forces.normal_contacts_energy(rows.gap, rows.stiffness, smoothing, rows.count)
         slips = self._trial_slips(state)
-        return energy + kernels.friction_energy(slips, friction.bound, friction.stiffness, len(slips))
+        return energy + forces.friction_energy(slips, friction.bound, friction.stiffness, len(slips))
 
     def add_gradient(self, state: State, derivatives: Derivatives) -> float:
         """Add the gradient, return the energy [J]; friction at the lagged bounds."""
         energy, slips = self._add(state, derivatives, gradient=True)
-        return energy + kernels.friction_energy(slips, self.friction.bound, self.friction.stiffness, len(slips))
+        return energy + forces.friction_energy(slips, self.friction.bound, self.friction.stiffness, len(slips))
 
     def add_hessian(self, state: State, derivatives: Derivatives, *, projected: bool = False) -> None:
         """Add the Hessian; ``projected``: a semidefinite one, exact for friction, Gauss-Newton for the penalty."""
@@ -179,12 +180,12 @@ class PenaltyContact:
         self._find(state)
         rows, f = self.rows, self.friction
         out = (d.soft, d.rigid, d.blocks, d.coupling, d.rigid_matrix, gradient, not gradient)
-        energy = kernels.add_normal(
+        energy = forces.add_normal(
             self.surface.faces, self.face_slots, rows.face, rows.weight, rows.gap, rows.normal, rows.arm,
             rows.stiffness, rows.rigid, rows.turns, rows.curve, rows.count, self.options.smoothing_mm * MM, *out, exact,
         )
         slips = self._trial_slips(state)
-        kernels.add_friction(
+        forces.add_friction(
             self.surface.faces, self.face_slots, f.face, f.weight, slips, f.bound, f.stiffness, f.normal, f.start_arm,
             f.rigid, self._turn_jacobians(state), len(slips), *out,
         )
@@ -242,7 +243,7 @@ class PenaltyContact:
         """Accept ``state``: return mapping of the elastic slip; forces and penetration for the outside."""
         friction = self.friction
         slips = self._trial_slips(state)
-        kernels.return_mapping(slips, friction.bound, friction.stiffness, len(slips))
+        forces.return_mapping(slips, friction.bound, friction.stiffness, len(slips))
         for r in range(len(self.scene.rigid_bodies)):
             mine = friction.rigid == r
             slips[mine] = slips[mine] @ state.rigid_rotations[r]
@@ -265,7 +266,7 @@ class PenaltyContact:
         f, start = self.friction, self.start
         slips = np.empty((len(f.key), 3))
         shift = state.rigid_positions - start.rigid_positions
-        kernels.elastic_slips(
+        forces.elastic_slips(
             state.positions, shift, self._turns(state), self.surface.faces, f.face, f.weight, f.start_point,
             f.start_arm, f.start_slip, f.normal, f.rigid, len(slips), slips,
         )
