@@ -25,11 +25,11 @@ LIBRARIES = {
     "annotated_types": "annotated-types", "threadpoolctl": "threadpoolctl",
 }
 
-#: linear solvers: module -> (distribution, what it is, how to get it)
+#: linear solvers: module (or library, without a module) -> (distribution, what it is, how to get it)
 SOLVERS = {
     "scipy": ("scipy", "SuperLU, always there", ""),
     "qdldl": ("qdldl", "sparse LDL, the default", "pip install qdldl"),
-    "pypardiso": ("pypardiso", "MKL Pardiso, the fastest here", "pip install 'finqd[fast]'"),
+    "mkl": ("mkl", "MKL's Pardiso, the fastest", "pip install 'finqd[fast]'"),
 }
 
 
@@ -97,7 +97,10 @@ def _solver(module: str) -> Finding:
     distribution, what, how = SOLVERS[module]
     subject = f"solver {module}"
     try:
-        import_module(module)
+        if module != "mkl":
+            import_module(module)
+        elif "pardiso" not in import_module("finqd.mechanics.linear_backends").available_backends():
+            raise ImportError("no MKL library here")
     except (ImportError, OSError):
         return Finding(subject, "optional", f"{what}; not here, {how}" if how else f"{what}; not here")
     return Finding(subject, "ok", f"{what}; {_version(distribution)}")

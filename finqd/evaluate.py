@@ -15,7 +15,7 @@ import numpy as np
 
 from finqd.assumptions import ASSUMPTIONS, EFFECTS
 from finqd.contracts import FitnessResult
-from finqd.errors import InputError, MeshError
+from finqd.errors import FinqdError, InputError, MeshError
 from finqd.grasp import GraspTask, base_height, simulate_grasp
 from finqd.meshing import mesh_solid
 from finqd.objects import GraspObject, load_object, object_names
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from finqd.mesh import Mesh
     from finqd.solid import Solid
 
-LIBRARIES = ("finqd", "numpy", "scipy", "numba", "gmsh", "qdldl", "pypardiso")
+LIBRARIES = ("finqd", "numpy", "scipy", "numba", "gmsh", "qdldl", "mkl")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,9 @@ class Evaluation:
 
     status: "ok", or "mesh_failed" if there was nothing to simulate; reason: one sentence then
     features: in the units that their names end in; trajectories: object name -> Trajectory
-    timings: wall-clock seconds; the only part, with each object's ``seconds``, that differs between equal runs
+    object_assumptions: what had to be assumed of the objects, one sentence each
+    timings: wall-clock seconds; the only part, with each object's ``seconds``, that differs between equal runs.
+    "compile" is part of "simulation" (summed over processes): kernels compiled, or loaded from Numba's cache
     """
 
     design: Design
@@ -50,6 +52,7 @@ class Evaluation:
     trajectories: Mapping[str, Trajectory]
     mesh: Mapping[str, Any]
     timings: Mapping[str, float] = field(compare=False)
+    object_assumptions: tuple[str, ...] = ()
 
     @property
     def fitness(self) -> float:
@@ -69,7 +72,7 @@ class Evaluation:
             "margin": self.margin, "features": dict(self.features),
             "objects": {name: self._row(name, trajectory) for name, trajectory in self.trajectories.items()},
             "mesh": dict(self.mesh), "timings": dict(self.timings), "effects": EFFECTS,
-            "assumptions": [*ASSUMPTIONS, *self.design.warnings], "versions": versions(),
+            "assumptions": [*ASSUMPTIONS, *self.object_assumptions, *self.design.warnings], "versions": versions(),
         }
 
     def _row(self, name: str, trajectory: Trajectory) -> dict[str, Any]:
@@ -86,7 +89,8 @@ class Evaluation:
             "simulated_s": float(trajectory.times[-1]) if simulated else 0.0,
             "steps": trajectory.counters.get("steps", 0),
             "newton_iterations": trajectory.counters.get("newton_iterations", 0),
-            "counters": dict(trajectory.counters), "seconds": sum(trajectory.timings.values()),
+            "counters": dict(trajectory.counters),
+            "seconds": trajectory.timings.get("set_up", 0.0) + trajectory.timings.get("steps", 0.0),
         }
 
 
@@ -123,10 +127,12 @@ def evaluate(
     else:
         trajectories = {g.name: Trajectory(status=status, reason=reason, protocol=chosen.protocol) for g in grasped}
     timings["simulation"] = clock.perf_counter() - simulated
+    timings["compile"] = sum(t.timings.get("compile", 0.0) for t in trajectories.values())
     timings["total"] = clock.perf_counter() - begun
     return Evaluation(
         design=chosen, preset=preset, status=status, reason=reason, result=chosen.plugin("fitness").score(trajectories),
         features=features, trajectories=trajectories, mesh=mesh, timings=timings,
+        object_assumptions=tuple(sentence for g in grasped for sentence in g.assumptions),
     )
 
 
@@ -185,8 +191,8 @@ def _simulated(
 
 def _as_trajectory(result: Any, design: Design, name: str) -> Trajectory:
     if isinstance(result, TaskFailure):
-        if isinstance(result.exception, InputError):
-            raise result.exception
+        if isinstance(result.exception, FinqdError) and not isinstance(result.exception, MeshError):
+            raise result.exception  # bad input, or a library that is missing: no fault of the design's
         return Trajectory(status=result.kind, reason=result.reason, object_name=name, protocol=design.protocol)
     return result
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -89,8 +90,26 @@ def overlapping_finger(scene: Scene, grasped: RigidBody) -> str | None:
     return None
 
 
+@contextmanager
+def compile_clock() -> Iterator[Callable[[], float]]:
+    """Yield a function that says how long [s] Numba has compiled kernels, or loaded them from its cache, so far."""
+    from numba.core import event
+
+    with event.install_listener("numba:compiler_lock", event.TimingListener()) as timer:
+        yield lambda: timer.duration if timer.done else 0.0
+
+
 def simulate_grasp(task: GraspTask, *, progress: Callable[[float], None] | None = None) -> Trajectory:
-    """Run one grasp; whatever goes wrong in the mechanics is the trajectory's status and reason."""
+    """Run one grasp; whatever goes wrong in the mechanics is the trajectory's status and reason.
+
+    The trajectory's timings hold "compile" too: what of the other timings went into compiling or loading kernels.
+    """
+    with compile_clock() as compiled:
+        trajectory = _simulated(task, progress)
+        return replace(trajectory, timings={**trajectory.timings, "compile": compiled()})
+
+
+def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Trajectory:
     design, protocol = task.design, task.design.protocol
     scene, grasped = grasp_scene(task)
     finger = overlapping_finger(scene, grasped)

@@ -353,3 +353,10 @@ def test_elsewhere_each_object_is_told_of_once(capsys):
     with shown_progress(quiet=True) as progress:
         progress("sphere", 1.0)
     assert capsys.readouterr().err == ""
+
+
+def test_the_presets_on_offer_are_those_there_are():
+    from finqd import cli, presets
+
+    assert cli.PRESETS == tuple(presets.PRESETS)  # written twice only so that --help stays light
+    assert presets.DEFAULT in cli.PRESETS

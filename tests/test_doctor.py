@@ -66,10 +66,20 @@ def test_a_missing_library_is_missing_and_says_how_to_get_it(imports_that_fail):
 
 
 def test_a_missing_optional_solver_does_not_make_the_machine_unfit(imports_that_fail):
-    imports_that_fail["pypardiso"] = ModuleNotFoundError("No module named 'pypardiso'")
-    finding = by_subject(doctor.examine())["solver pypardiso"]
-    assert finding.status == "optional" and "finqd[fast]" in finding.detail
+    imports_that_fail["qdldl"] = ModuleNotFoundError("No module named 'qdldl'")
+    finding = by_subject(doctor.examine())["solver qdldl"]
+    assert finding.status == "optional" and "pip install qdldl" in finding.detail
     assert doctor.fit([finding])
+
+
+@pytest.mark.parametrize(("backends", "status"), [(("qdldl", "superlu"), "optional"), (("pardiso", "qdldl"), "ok")])
+def test_mkl_is_looked_for_as_the_solver_does(monkeypatch, backends, status):
+    from finqd.mechanics import linear_backends
+
+    monkeypatch.setattr(linear_backends, "available_backends", lambda: backends)
+    finding = by_subject(doctor.examine())["solver mkl"]
+    assert finding.status == status and doctor.fit([finding])
+    assert ("finqd[fast]" in finding.detail) == (status == "optional")
 
 
 def test_an_old_python_is_told_apart_from_a_new_one():

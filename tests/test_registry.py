@@ -180,3 +180,16 @@ def test_options_say_name_default_unit_and_range(mine):
     }
     assert found["count"].allowed == "a whole number from 1 to 10" and found["count"].unit == ""
     assert found["mode"].schema["enum"] == ["a", "b"]
+
+
+def test_what_is_installed_is_looked_up_once_for_each_path(mine, monkeypatch):
+    calls = []
+    real = registry.entry_points
+    monkeypatch.setattr(registry, "entry_points", lambda: calls.append(1) or real())
+    registry._scanned.cache_clear()
+    for _ in range(3):
+        assert "mine" in registry.names("mesher") and registry.load("geometry", "mine")
+    assert len(calls) == 1
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if "fake-fingers" not in entry])
+    assert "mine" not in registry.names("mesher"), "another path is looked at anew"
+    assert len(calls) == 2
