@@ -1,6 +1,6 @@
 """Reference elements as a mesh needs them: nodes, faces, Gauss points and shape gradients.
 
-Shape functions come from the monomials that span each type: N(xi) = m(xi) M^-1 with M the monomials at the nodes.
+Shape functions are those of `finqd.mechanics.elements`; nodes are in the same order there.
 """
 
 from __future__ import annotations
@@ -57,47 +57,12 @@ class Reference(NamedTuple):
 @cache
 def reference(kind: str) -> Reference:
     """Return the reference element of a type."""
-    nodes, exponents = _nodes(kind), _exponents(kind)
+    from finqd.mechanics.elements import element  # brings scipy, which a mesh that is only carried about does not need
+
     points, weights = _gauss(kind)
-    inverse = np.linalg.inv(_monomials(nodes, exponents))
-    gradients = np.stack([_monomials(points, exponents, axis) @ inverse for axis in range(3)], axis=-1)
+    gradients = element(kind).shape_gradients(points)
     scale = {"hex": 1.0, "wed": 2.0 / np.sqrt(3.0), "tet": np.sqrt(2.0)}[kind[:3]]
     return Reference(gradients, weights, _corner_edges(kind), scale)
-
-
-def _nodes(kind: str) -> np.ndarray:
-    tet = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    cube = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-    corners = {
-        "tet": tet,
-        "hex": [(x, y, z) for z in (-1, 1) for x, y in cube],
-        "wed": [(x, y, z) for z in (-1, 1) for x, y in ((0, 0), (1, 0), (0, 1))],
-    }[kind[:3]]
-    nodes = np.array(corners, dtype=float)
-    middles = [0.5 * (nodes[i] + nodes[j]) for i, j in MID_EDGES.get(kind, ())]
-    return np.array([*nodes, *middles])
-
-
-def _exponents(kind: str) -> np.ndarray:
-    def spans(a: int, b: int, c: int) -> bool:
-        return {
-            "tet4": a + b + c <= 1,
-            "tet10": a + b + c <= 2,
-            "hex8": max(a, b, c) <= 1,
-            "hex20": (a, b, c).count(2) <= 1,
-            "wedge6": a + b <= 1 and c <= 1,
-        }[kind]
-
-    return np.array([e for e in product(range(3), repeat=3) if spans(*e)])
-
-
-def _monomials(points: np.ndarray, exponents: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Return monomials, or their derivative along ``axis``, at points (n, 3): shape (n, monomials)."""
-    factor, powers = np.ones(len(exponents)), exponents.copy()
-    if axis is not None:
-        factor = exponents[:, axis].astype(float)
-        powers[:, axis] = np.maximum(powers[:, axis] - 1, 0)
-    return factor * np.prod(points[:, None, :] ** powers[None], axis=-1)
 
 
 def _gauss(kind: str) -> tuple[np.ndarray, np.ndarray]:
