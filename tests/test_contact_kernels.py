@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finqd.mechanics import contact_force_kernels as forces
+from finqd.mechanics import contact_force_kernels as force_kernels
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal, hold, largest_force
 from finqd.mechanics.contact_surface import contact_surface, lattice
@@ -26,9 +26,9 @@ STIFFNESS, SMOOTHING = 2e5, 1e-5  # [N/m], [m]
 @pytest.mark.parametrize("penetration", [0.2e-5, 0.9e-5, 1.1e-5, 5e-5])
 def test_normal_force_is_the_slope_of_its_energy(penetration: float) -> None:
     h = 1e-9
-    force, slope = forces.normal_force(-penetration, STIFFNESS, SMOOTHING)
-    energies = [forces.normal_energy(-(penetration + s * h), STIFFNESS, SMOOTHING) for s in (-1, 1)]
-    forces = [forces.normal_force(-(penetration + s * h), STIFFNESS, SMOOTHING)[0] for s in (-1, 1)]
+    force, slope = force_kernels.normal_force(-penetration, STIFFNESS, SMOOTHING)
+    energies = [force_kernels.normal_energy(-(penetration + s * h), STIFFNESS, SMOOTHING) for s in (-1, 1)]
+    forces = [force_kernels.normal_force(-(penetration + s * h), STIFFNESS, SMOOTHING)[0] for s in (-1, 1)]
     assert force > 0.0
     assert (energies[1] - energies[0]) / (2 * h) == pytest.approx(force, rel=1e-6)
     assert (forces[1] - forces[0]) / (2 * h) == pytest.approx(slope, rel=1e-6)
@@ -38,14 +38,14 @@ def test_normal_penalty_is_smooth_where_its_pieces_meet() -> None:
     for edge in (0.0, SMOOTHING):
         below, above = edge - 1e-15, edge + 1e-15
         values = [
-            (forces.normal_energy(-p, STIFFNESS, SMOOTHING), *forces.normal_force(-p, STIFFNESS, SMOOTHING))
+            (force_kernels.normal_energy(-p, STIFFNESS, SMOOTHING), *force_kernels.normal_force(-p, STIFFNESS, SMOOTHING))
             for p in (below, above)
         ]
         scale = (STIFFNESS * SMOOTHING**2, STIFFNESS * SMOOTHING, STIFFNESS)
         assert np.all(np.abs(np.subtract(*values)) < 1e-8 * np.array(scale))
-    assert forces.normal_energy(1e-9, STIFFNESS, SMOOTHING) == 0.0
+    assert force_kernels.normal_energy(1e-9, STIFFNESS, SMOOTHING) == 0.0
     deep = 1e-3
-    force, _ = forces.normal_force(-deep, STIFFNESS, SMOOTHING)
+    force, _ = force_kernels.normal_force(-deep, STIFFNESS, SMOOTHING)
     assert force == pytest.approx(STIFFNESS * (deep - SMOOTHING / 2), rel=1e-12)
 
 
@@ -63,7 +63,7 @@ def test_sides_that_look_away_do_not_push() -> None:
 def friction_gradient(slip: np.ndarray, bound: float, stiffness: float) -> np.ndarray:
     """Return the friction force on one soft vertex [N] through `add_friction`; its normal is z."""
     gradient, rigid = np.zeros((1, 3)), np.zeros((0, 6))
-    forces.add_friction(
+    force_kernels.add_friction(
         np.array([[0]]), np.array([[[0]]]), np.array([0]), np.ones((1, 1)), slip[None], np.array([bound]),
         np.array([stiffness]), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)), np.array([-1]), np.zeros((0, 3, 3)), 1,
         gradient, rigid, np.zeros((1, 3, 3)), np.zeros((3, 0)), np.zeros((0, 0)), True, False,
@@ -79,7 +79,7 @@ def test_friction_force_is_the_slope_of_its_energy(length: float) -> None:
     for i in range(2):
         step = h * np.eye(3)[i]
         bounds, springs = np.array([bound]), np.array([stiffness])
-        energies = [forces.friction_energy((slip + s * step)[None], bounds, springs, 1) for s in (-1, 1)]
+        energies = [force_kernels.friction_energy((slip + s * step)[None], bounds, springs, 1) for s in (-1, 1)]
         assert (energies[1] - energies[0]) / (2 * h) == pytest.approx(force[i], rel=1e-5)
     assert np.linalg.norm(force) == pytest.approx(min(stiffness * length, bound), rel=1e-12)
 
@@ -87,7 +87,7 @@ def test_friction_force_is_the_slope_of_its_energy(length: float) -> None:
 def test_return_mapping_shortens_to_the_cone_and_no_further() -> None:
     slips = np.array([[3e-5, 4e-5, 0.0], [1e-6, 0.0, 0.0], [0.0, 0.0, 0.0]])
     before = slips.copy()
-    forces.return_mapping(slips, np.array([1.0, 1.0, 0.0]), np.array([1e5, 1e5, 1e5]), 3)
+    force_kernels.return_mapping(slips, np.array([1.0, 1.0, 0.0]), np.array([1e5, 1e5, 1e5]), 3)
     assert np.allclose(slips[0], [0.6e-5, 0.8e-5, 0.0], rtol=1e-12)
     assert np.array_equal(slips[1:], before[1:])
     # what is left pulls with the force that the energy's slope gave before
@@ -98,7 +98,7 @@ def test_a_ball_that_rolls_does_not_slip() -> None:
     radius, turn = 0.02, np.array([[0.0, 1e-3, 0.0]])
     slips = np.empty((1, 3))
     shift = np.array([[radius * turn[0, 1], 0.0, 0.0]])
-    forces.elastic_slips(
+    force_kernels.elastic_slips(
         np.zeros((0, 3)), shift, turn, np.zeros((0, 4), dtype=np.int64), np.array([-1]), np.zeros((1, 4)),
         np.zeros((1, 3)), np.array([[0.0, 0.0, -radius]]), np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]),
         np.array([0]), 1, slips,
