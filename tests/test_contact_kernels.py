@@ -38,7 +38,10 @@ def test_normal_penalty_is_smooth_where_its_pieces_meet() -> None:
     for edge in (0.0, SMOOTHING):
         below, above = edge - 1e-15, edge + 1e-15
         values = [
-            (force_kernels.normal_energy(-p, STIFFNESS, SMOOTHING), *force_kernels.normal_force(-p, STIFFNESS, SMOOTHING))
+            (
+                force_kernels.normal_energy(-p, STIFFNESS, SMOOTHING),
+                *force_kernels.normal_force(-p, STIFFNESS, SMOOTHING),
+            )
             for p in (below, above)
         ]
         scale = (STIFFNESS * SMOOTHING**2, STIFFNESS * SMOOTHING, STIFFNESS)
