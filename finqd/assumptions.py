@@ -19,7 +19,7 @@ EFFECTS = {
 #: finqd's own choices where the paper gives none
 ASSUMPTIONS = (
     "object sizes, density, friction, time step, stroke, lift and hold time are finqd's choices: the paper gives none",
-    "finger profile: isosceles triangle, walls measured perpendicular, base plate 2 mm, ribs clipped by the cavity",
+    "finger profile: isosceles triangle unless the design says right, walls measured perpendicular, base plate 2 mm, ribs clipped by the cavity",
     "the mount's volume is a 2.75 mm plate over the workspace triangle, chosen to give the paper's benchmark volume",
     "rib centres lie on the line from the base's middle to the apex; a positive tilt lifts a rib's back end",
     "slivers of a hole with less than 1e-4 mm^2 are filled",
