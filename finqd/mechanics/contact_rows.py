@@ -99,8 +99,9 @@ class Rows:
         arm, slip = self.arm[used], slips[key]
         for r in range(len(start.rigid_positions)):
             mine = rigid == r
+            turning = mine & (self.turns[used] != 0)  # a ball touches a plane with its lowest point, however it turns
             then = start.rigid_rotations[r]
-            arm[mine] = arm[mine] @ (then @ state.rigid_rotations[r].T).T
+            arm[turning] = arm[turning] @ (then @ state.rigid_rotations[r].T).T
             slip[mine] = slip[mine] @ then.T
         return FrictionRows(
             key=key, face=face, weight=weight, rigid=rigid, bound=bound[used], stiffness=ratio * self.stiffness[used],

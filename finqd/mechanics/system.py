@@ -163,7 +163,7 @@ class System:
         d = self.derivatives
         best, vertex = largest_force(d.soft, self.fixed)
         where = self._vertex_name(vertex) if vertex >= 0 else ""
-        for i, row in enumerate(d.rigid):
+        for i, row in enumerate(d.rigid if np.isfinite(best) else ()):
             force = max(np.linalg.norm(row[:3]), np.linalg.norm(row[3:]) / self.rigid_sizes[i])
             if not force <= best:
                 best, where = float(force), self.scene.rigid_bodies[i].name

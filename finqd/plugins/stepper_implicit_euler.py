@@ -68,7 +68,8 @@ class ImplicitEuler:
                 report.reason = f"the forces are no longer finite ({report.where})"
                 break
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
-            done = report.residual <= self.tolerance_N and report.iterations > 0
+            least = self.tolerance_N if report.iterations else 1e-3 * self.tolerance_N
+            done = report.residual <= least
             if done and system.contact.strain(trial) > 1.0:
                 report.reason = "edges slid too far over soft faces in one step"
                 return trial
