@@ -19,11 +19,13 @@ EFFECTS = {
 #: finqd's own choices where the paper gives none
 ASSUMPTIONS = (
     "object sizes, density, friction, time step, stroke, lift and hold time are finqd's choices: the paper gives none",
-    "finger profile: isosceles triangle unless the design says right, walls measured perpendicular, base plate 2 mm, ribs clipped by the cavity",
+    "finger profile: isosceles triangle unless the design says right, walls measured perpendicular, base plate 2 mm",
+    "ribs are clipped by the cavity; N ribs stand at N + 1 equal pitches between the base plate and the tip line",
     "the mount's volume is a 2.75 mm plate over the workspace triangle, chosen to give the paper's benchmark volume",
     "rib centres lie on the line from the base's middle to the apex; a positive tilt lifts a rib's back end",
     "slivers of a hole with less than 1e-4 mm^2 are filled",
     "features are the gripper's as built: the pads that an export adds are in none of them",
+    "objects are rigid; a rigid body's inertia is taken at the start of a step, so fast tumbling gains some energy",
     "the mount is rigid: each finger base is driven as a whole",
     "each finger's drive stalls by itself when the sum of the normal contact forces on that finger reaches its limit",
     "the object starts at rest on the floor, centred under the gripper",

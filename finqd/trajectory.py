@@ -55,7 +55,7 @@ class Trajectory:
     contact_forces: sum of the normal forces on each soft body [N], (n_frames, n_soft)
     penetrations: largest since the frame before [m], (n_frames,)
     stroke: share of its time that each drive has run, (n_frames, n_motions)
-    energies: name -> [J], (n_frames,)
+    energies: name -> [J], (n_frames,); kinetic and elastic are those of the soft bodies
     soft_positions: [m], (n_recorded, n_vertices, 3), at recorded_times [s], (n_recorded,): empty without recording
     counters: steps, rejected_steps, newton_iterations, line_search_steps, factorisations, cg_iterations, ...
     object_drop: how far the object fell relative to the gripper [m], NaN if unknown
