@@ -173,6 +173,7 @@ class RigidBody:
     velocity: np.ndarray
     angular_velocity: np.ndarray
     force: np.ndarray  # dead load at the centre of mass [N]
+    held: bool = False  # stays where it is, whatever pushes it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -220,14 +221,14 @@ class Scene:
     def add_rigid(
         self, shape: GraspObject, *, position: Sequence[float], rotation: np.ndarray | None = None,
         velocity: Sequence[float] = (0.0, 0.0, 0.0), angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
-        force: Sequence[float] = (0.0, 0.0, 0.0), name: str = "",
+        force: Sequence[float] = (0.0, 0.0, 0.0), name: str = "", held: bool = False,
     ) -> RigidBody:
-        """Add a rigid body with its centre of mass at ``position`` [m]."""
+        """Add a rigid body with its centre of mass at ``position`` [m]; ``held``: it stays there, whatever pushes it."""
         body = RigidBody(
             name=self._new_name(name or shape.name), shape=shape, position=np.asarray(position, dtype=float),
             rotation=np.eye(3) if rotation is None else np.asarray(rotation, dtype=float),
             velocity=np.asarray(velocity, dtype=float), angular_velocity=np.asarray(angular_velocity, dtype=float),
-            force=np.asarray(force, dtype=float),
+            force=np.asarray(force, dtype=float), held=held,
         )
         self.rigid_bodies.append(body)
         return body

@@ -81,7 +81,7 @@ class EulerIncrement:
         d.rigid[:, :3] += (system.rigid_masses / self.dt**2)[:, None] * (state.rigid_positions - self.rigid_inertial)
         for b, turn in enumerate(turns):
             d.rigid[b, 3:] += inverse_left_jacobian(turn).T @ self.inertias[b] @ (turn - self.spins[b]) / self.dt**2
-        d.soft[system.fixed] = 0.0
+        system.clear_held()
         return energy
 
     def hessian(self, state: State, *, projected: bool = False) -> None:

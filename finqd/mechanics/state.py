@@ -30,6 +30,7 @@ class State:
     rigid_rotations: body frame to world, shape (n_rigid, 3, 3)
     angular_momenta: about the centres of mass, world frame [kg m^2/s], shape (n_rigid, 3)
     progress: share of its time that each driven motion has run, shape (n_motions,), in [0, 1]
+    previous: the state one step earlier, where a stepper needs it (that one without a ``previous`` of its own)
     """
 
     time: float
@@ -40,6 +41,7 @@ class State:
     rigid_velocities: np.ndarray
     angular_momenta: np.ndarray
     progress: np.ndarray
+    previous: State | None = None
 
     def moved(self, direction: Direction, share: float = 1.0) -> State:
         """Return the state with positions and rotations moved by ``share`` of ``direction``."""
@@ -62,6 +64,8 @@ class StepReport:
 
     residual: largest force that is left unbalanced [N]; where: what it acts on
     residuals: the history over the iterations [N]
+    error: estimate of the step's own error [m], NaN where the stepper makes none
+    next_dt: how long the stepper would make the next step (or this one, tried again) [s], None if it has no opinion
     """
 
     converged: bool = False
@@ -75,3 +79,5 @@ class StepReport:
     residual: float = float("nan")
     where: str = ""
     residuals: list[float] | None = None
+    error: float = float("nan")
+    next_dt: float | None = None

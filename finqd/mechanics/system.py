@@ -49,7 +49,7 @@ class System:
     masses: lumped [kg], (n_vertices,); forces: gravity and dead loads [N], (n_vertices, 3)
     rigid_masses [kg], (n_rigid,); rigid_inertias: body frame [kg m^2], (n_rigid, 3, 3); rigid_forces [N], (n_rigid, 3)
     rigid_sizes: radius that turns a torque into a force for the residual [m], (n_rigid,)
-    fixed: bool, (n_vertices, 3)
+    fixed: bool, (n_vertices, 3); rigid_held: bool, (n_rigid,)
     """
 
     def __init__(self, scene: Scene, *, contact: Contact) -> None:
@@ -66,6 +66,7 @@ class System:
         self.rigid_masses = np.array([b.shape.mass for b in rigid])
         self.rigid_inertias = np.array([b.shape.inertia for b in rigid]).reshape(m, 3, 3)
         self.rigid_forces = np.array([b.force + b.shape.mass * scene.gravity for b in rigid]).reshape(m, 3)
+        self.rigid_held = np.array([b.held for b in rigid], dtype=bool)
         self.rigid_sizes = np.array([b.shape.bounding_radius for b in rigid])
         self.potentials = [b.elasticity.potential(b.mesh, b.material, first_vertex=b.first_vertex) for b in soft]
         self.pattern = BlockPattern.from_cliques(n, [c for p in self.potentials for c in p.cliques])
@@ -154,6 +155,22 @@ class System:
         """Make held degrees of freedom drop out of the Hessian."""
         d = self.derivatives
         hold(self.pattern.indptr, self.pattern.indices, self.fixed, d.blocks, d.coupling)
+        for b in np.flatnonzero(self.rigid_held):
+            body = slice(6 * b, 6 * b + 6)
+            d.coupling[:, body] = 0.0
+            d.rigid_matrix[body] = d.rigid_matrix[:, body] = 0.0
+            d.rigid_matrix[body, body] = np.eye(6)
+
+    def clear_held(self) -> None:
+        """Make held degrees of freedom drop out of the gradient."""
+        self.derivatives.soft[self.fixed] = 0.0
+        self.derivatives.rigid[self.rigid_held] = 0.0
+
+    def contact_forces_on_rigid(self, state: State) -> np.ndarray:
+        """Return force [N] and torque [N m] of all contacts on each rigid body at ``state``, shape (n_rigid, 6)."""
+        self.derivatives.clear_gradient()
+        self.contact.add_gradient(state, self.derivatives)
+        return -self.derivatives.rigid
 
     def residual(self) -> tuple[float, str]:
         """Return the largest unbalanced force in `derivatives` [N] and what it acts on.
