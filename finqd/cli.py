@@ -20,7 +20,7 @@ from finqd import __version__
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, InputError
 
-PRESETS = ("draft", "standard", "fine")
+PRESETS = ("draft", "standard", "fine", "reference", "paper")
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

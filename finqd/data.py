@@ -1,7 +1,7 @@
-"""Where the files that come with finqd are: the objects and the designs.
+"""Where the files that come with finqd are: the objects, the designs, and what studies of its accuracy have measured.
 
-In a checkout they are the folders ``objects`` and ``designs`` at its top; a wheel carries them inside the package
-(``finqd/bundled``), since a wheel has no top level of its own.
+In a checkout they are the folders ``objects``, ``designs`` and ``studies`` at its top; a wheel carries them inside the
+package (``finqd/bundled``), since a wheel has no top level of its own.
 """
 
 from __future__ import annotations
@@ -21,6 +21,11 @@ def objects_folder() -> Path:
 def designs_folder() -> Path:
     """Return the folder with the design files that come with finqd."""
     return _folder("designs")
+
+
+def studies_folder() -> Path:
+    """Return the folder with what has been measured of finqd's own accuracy."""
+    return _folder("studies")
 
 
 def bundled_names(folder: Path) -> list[str]:

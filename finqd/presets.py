@@ -1,12 +1,20 @@
-"""Named trades of accuracy against time: ``draft``, ``standard`` and ``fine``.
+"""Named trades of accuracy against time: ``draft``, ``standard``, ``fine``, ``reference``, and ``paper``.
 
-A preset sets what a design leaves open: a value that a design file (or ``--set``) gives wins over it, and options of a
-plugin are taken only where that plugin is the one in use. How large the error of each preset is has not been measured
-yet; that is a later issue, and until then the names only say which is coarser.
+A preset sets what a design leaves open. Of each kind of plugin it may choose one, and give options to it and to others
+of that kind: a design that names another plugin keeps it, and takes only that plugin's options. A value that a design
+file (or ``--set``) gives always wins. How far off each preset is, `finqd.accuracy_bands` says.
+
+>>> from finqd.data import designs_folder
+>>> design = Design.from_json(designs_folder() / "benchmark.json")
+>>> apply_preset(design, "paper").spec("mesher")
+{'name': 'tetrahedral', 'size_mm': 2.0, 'order': 1}
+>>> departures(apply_preset(design, "paper", overrides={"mesher.size_mm": 1}), "paper")
+('mesher.size_mm is 1, not 2',)
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from finqd.design import Design
@@ -14,7 +22,7 @@ from finqd.errors import InputError
 
 DEFAULT = "standard"
 
-#: preset -> section -> what it sets; sections of plugins by the plugin's name
+#: preset -> section -> options by plugin, of which the preset chooses the first; the protocol has no plugin
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "mesher": {"swept": {"size_mm": 6.0}, "tetrahedral": {"size_mm": 6.0}},
@@ -28,18 +36,84 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "mesher": {"swept": {"size_mm": 2.0}, "tetrahedral": {"size_mm": 2.0}},
         "protocol": {"time_step_ms": 5.0},
     },
-}
+    "reference": {
+        "mesher": {"swept": {"size_mm": 1.5}, "tetrahedral": {"size_mm": 1.5}},
+        "protocol": {"time_step_ms": 2.5},
+    },
+    # what the paper says of its solver; the time step is that of public scenes of the simulator it used
+    "paper": {
+        "mesher": {"tetrahedral": {"size_mm": 2.0, "order": 1}, "swept": {"size_mm": 2.0}},
+        "elasticity": {"corotated": {}},
+        "stepper": {
+            "implicit_euler": {
+                "linear_solver": "cg", "preconditioner": "jacobi", "linear_iterations": 1000, "linear_tolerance": 1e-6,
+            },
+        },
+        "protocol": {"time_step_ms": 10.0},
+    },
+}  # fmt: skip
+
+#: sections that decide how exact a result is; of the protocol only the time step does
+NUMERICS = ("mesher", "elasticity", "stepper", "contact")
+TIME_STEP = "time_step_ms"
+HARMLESS = ("backend",)  # options that change how long a result takes, and not the result
 
 
-def apply_preset(design: Design, name: str = DEFAULT) -> Design:
-    """Return the design with what it leaves open set by a preset. Raises ``InputError`` for an unknown name."""
+def apply_preset(
+    design: Design, name: str = DEFAULT, *, overrides: Mapping[str, Any] | None = None, source: str = "override:"
+) -> Design:
+    """Return the design with what it leaves open set by a preset.
+
+    overrides: values by JSON path, stronger than design and preset; ``mesher.size_mm`` is an option of the mesher in
+    use, which may be the preset's. ``source`` is put in front of what is wrong with them. Raises ``InputError`` for
+    them and for an unknown name.
+    """
+    filled = _filled(design, preset_table(name))
+    if not overrides:
+        return filled
+    return _filled(filled.with_overrides(overrides, source=source), preset_table(name))
+
+
+def preset_table(name: str) -> dict[str, dict[str, Any]]:
+    """Return what a preset sets, a row of `PRESETS`. Raises ``InputError`` for an unknown name."""
     if name not in PRESETS:
         raise InputError(f"there is no preset {name!r}; known: {', '.join(PRESETS)}", where="--preset")
+    return PRESETS[name]
+
+
+def departures(design: Design, name: str) -> tuple[str, ...]:
+    """Return in what a design (with the preset applied) departs from what the preset alone would give, in words.
+
+    Looked at are all options of mesher, elasticity, stepper and contact, and the time step.
+    """
+    shape = ("geometry", "finger", "fingers", "spacing_mm")
+    bare = {key: value for key, value in design.to_dict().items() if key in shape}
+    plain, actual = apply_preset(Design(bare), name).resolved(), design.resolved()
+    found = []
+    for kind in NUMERICS:
+        wanted, given = plain[kind], actual[kind]
+        if wanted["name"] != given["name"]:
+            found.append(f"{kind} is {given['name']}, not {wanted['name']}")
+            continue
+        found += [f"{kind}.{key} is {_shown(given[key])}, not {_shown(wanted[key])}"
+                  for key in wanted if given[key] != wanted[key] and key not in HARMLESS]
+    wanted, given = plain["protocol"][TIME_STEP], actual["protocol"][TIME_STEP]
+    if wanted != given:
+        found.append(f"protocol.{TIME_STEP} is {_shown(given)}, not {_shown(wanted)}")
+    return tuple(found)
+
+
+def _filled(design: Design, table: Mapping[str, Mapping[str, Any]]) -> Design:
+    """Return the design with the values of ``table`` where it has none."""
     document = design.to_dict()
-    for section, values in PRESETS[name].items():
+    for section, values in table.items():
         if section == "protocol":
             document[section] = {**values, **document.get(section, {})}
         else:
-            spec = design.spec(section)
+            spec = design.spec(section) if section in document else {"name": next(iter(values))}
             document[section] = {**values.get(spec["name"], {}), **spec}
     return Design(document, design.source)
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
