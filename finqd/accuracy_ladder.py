@@ -1,0 +1,228 @@
+"""The rungs of an accuracy ladder: one knob at a time around the preset ``standard``, and the presets themselves.
+
+A rung is a set of values by JSON path over a preset: what ``--preset`` and ``--set`` say on the command line, so every
+rung can be pasted there. A rung whose plugin, option or library is not installed is kept apart, with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from finqd import registry
+from finqd.errors import InputError
+from finqd.presets import DEFAULT, PRESETS, apply_preset
+
+if TYPE_CHECKING:
+    from finqd.design import Design
+
+#: knob -> what it turns
+KNOBS = {
+    "size": "mesh size of the default element", "element": "element families, each over its mesh sizes",
+    "step": "time step", "stepper": "time integration", "adaptive": "time step from an error estimate",
+    "newton": "tolerance of Newton's method", "linear": "linear solver", "contact": "contact model",
+    "elasticity": "constitutive law", "preset": "the named presets",
+}
+#: sections of a design that say how it is computed rather than what it is
+NUMERICS = ("mesher", "elasticity", "stepper", "contact")
+STEP = "protocol.time_step_ms"
+NUMERICAL_CONSTANTS = ("time_step_ms", "wall_clock_limit_s")
+
+_TET4: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 1}
+_TET10: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 2}
+_HEX8: dict[str, Any] = {"mesher": "swept"}
+_HEX20: dict[str, Any] = {"mesher": "swept", "mesher.order": 2}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rung:
+    """One setting to be measured.
+
+    name: unique in a ladder; knob: a key of `KNOBS`; series: the curve it lies on
+    settings: JSON path -> value, over ``preset``
+    bare: what the design itself says of its numerics is left out first, so that preset and settings say it all
+    """
+
+    name: str
+    knob: str
+    series: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    preset: str = DEFAULT
+    bare: bool = False
+
+    def applied(self, design: Design) -> Design:
+        """Return the design that this rung computes. Raises ``InputError`` if something of it is not installed."""
+        start = without_numerics(design) if self.bare else design
+        return apply_preset(start.with_overrides(self.settings, source=f"rung {self.name}:"), self.preset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ladder:
+    """Rungs that can be run, and name -> reason of those that cannot."""
+
+    rungs: tuple[Rung, ...]
+    missing: Mapping[str, str]
+
+
+def without_numerics(design: Design) -> Design:
+    """Return the design without what it says of mesher, elasticity, stepper, contact and time step."""
+    from finqd.design import Design
+
+    document = {key: value for key, value in design.to_dict().items() if key not in NUMERICS}
+    protocol = {k: v for k, v in document.pop("protocol", {}).items() if k not in NUMERICAL_CONSTANTS}
+    return Design({**document, **({"protocol": protocol} if protocol else {})}, design.source)
+
+
+def build_ladder(design: Design, *, knobs: Iterable[str] = ()) -> Ladder:
+    """Return every rung of the chosen knobs (default: all) that is installed; ``standard`` is always among them.
+
+    Raises ``InputError`` for an unknown knob.
+    """
+    chosen = set(knobs) or set(KNOBS)
+    for knob in sorted(chosen - set(KNOBS)):
+        raise InputError(f"there is no knob {knob!r}; known: {', '.join(KNOBS)}", "--knob")
+    base = Rung(name=DEFAULT, knob="preset", series="preset", bare=True)
+    rungs: list[Rung] = [base]
+    missing: dict[str, str] = {}
+    for rung in _all_rungs():
+        if rung.knob not in chosen or rung.name == base.name:
+            continue
+        try:
+            rung.applied(design)
+            _require_backend(rung)
+        except InputError as error:
+            missing[rung.name] = error.message
+        else:
+            rungs.append(rung)
+    return Ladder(rungs=tuple(rungs), missing=missing)
+
+
+def reference_rungs(case: str, *, full: bool) -> tuple[Rung, Rung]:
+    """Return the finest rung of two element families that share nothing but the physics."""
+    if case == "press":
+        sizes, step = ((1.0, 2.0), 2.5) if full else ((1.5, 3.0), 5.0)
+    else:
+        sizes, step = ((1.5, 3.0), 2.5) if full else ((2.0, 4.0), 5.0)
+    return (
+        _rung("reference", "reference", f"hex8 {sizes[0]:g} mm, {step:g} ms",
+              {**_HEX8, "mesher.size_mm": sizes[0], "mesher.least_edges": 2, STEP: step}, bare=True),
+        _rung("reference", "reference", f"tet10 {sizes[1]:g} mm, {step:g} ms",
+              {**_TET10, "mesher.size_mm": sizes[1], STEP: step}, bare=True),
+    )
+
+
+def as_options(rung: Rung) -> str:
+    """Return the rung as one pastes it behind ``finqd evaluate DESIGN``.
+
+    >>> as_options(Rung(name="x", knob="size", series="size", settings={"mesher.size_mm": 2.0}))
+    '--preset standard --set mesher.size_mm=2'
+    """
+    return options_text(rung.preset, rung.settings)
+
+
+def options_text(preset: str, settings: Mapping[str, Any]) -> str:
+    """Return a preset and values by path as command line options."""
+    return " ".join([f"--preset {preset}", *(f"--set {path}={_plain(value)}" for path, value in settings.items())])
+
+
+def _rung(knob: str, series: str, name: str, settings: Mapping[str, Any], *, bare: bool = False) -> Rung:
+    return Rung(name=name, knob=knob, series=series, settings=settings, bare=bare)
+
+
+def _all_rungs() -> list[Rung]:
+    presets = [Rung(name=name, knob="preset", series="preset", preset=name, bare=True) for name in PRESETS]
+    return [
+        *presets, *_sizes(), *_steps(), *_steppers(), *_newton(), *_linear(), *_contacts(),
+        *_others("elasticity", "elasticity", known=("corotated",)),
+    ]
+
+
+def _sizes() -> list[Rung]:
+    families: tuple[tuple[str, str, dict[str, Any], Sequence[float]], ...] = (
+        ("size", "hex8", _HEX8, (8, 6, 4, 3, 2, 1.5, 1)), ("element", "hex20", _HEX20, (8, 6, 4, 3, 2)),
+        ("element", "tet10", _TET10, (8, 6, 4, 3, 2, 1.5)), ("element", "tet4", _TET4, (6, 4, 3, 2, 1.5, 1)),
+        ("element", "hex8, two through a wall", {**_HEX8, "mesher.least_edges": 2}, (6, 4, 3, 2)),
+    )
+    rungs = [
+        _rung(knob, f"size of {family}", f"{family} {size:g} mm", {**settings, "mesher.size_mm": size})
+        for knob, family, settings, sizes in families for size in sizes
+    ]
+    layers = [
+        _rung("element", "layers of hex8", f"hex8 4 mm, {n} layers", {**_HEX8, "mesher.size_mm": 4, "mesher.layers": n})
+        for n in (2, 3, 6)
+    ]
+    known = {"swept", "tetrahedral"}
+    return rungs + layers + [
+        _rung("element", f"mesher {name}", f"mesher {name}", {"mesher": name})
+        for name in registry.names("mesher") if name not in known
+    ]
+
+
+def _steps() -> list[Rung]:
+    return [_rung("step", "time step", f"step {dt:g} ms", {STEP: dt}) for dt in (40, 20, 10, 5, 2.5, 1.25)] + [
+        _rung("adaptive", "adaptive step", f"adaptive {tolerance:g} mm",
+              {"stepper.error_tolerance_mm": tolerance, STEP: 50})
+        for tolerance in (1, 0.3, 0.1, 0.03, 0.01)
+    ]
+
+
+def _steppers() -> list[Rung]:
+    steps: dict[str, tuple[float, ...]] = {
+        "bdf2": (40, 20, 10, 5, 2.5), "quasi_static": (50, 20, 10, 5), "imex": (10, 5, 2, 1, 0.5), "explicit": (10,),
+    }
+    known = [
+        _rung("stepper", f"step of {name}", f"{name} {dt:g} ms", {"stepper": name, STEP: dt})
+        for name, values in steps.items() for dt in values
+    ]
+    return known + _others("stepper", "stepper", known=(*steps, "implicit_euler"))
+
+
+def _newton() -> list[Rung]:
+    return [
+        _rung("newton", "Newton tolerance", f"tolerance {force:g} N", {"stepper.tolerance_N": force})
+        for force in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+    ]
+
+
+def _linear() -> list[Rung]:
+    rungs = [
+        _rung("linear", "linear solver", f"cg behind a factorisation, {backend}", {"stepper.backend": backend})
+        for backend in ("pardiso", "qdldl", "cholmod", "superlu")
+    ]
+    rungs.append(_rung("linear", "linear solver", "direct", {"stepper.linear_solver": "direct"}))
+    for kind in ("block_jacobi", "jacobi"):
+        values = {"stepper.preconditioner": kind, "stepper.linear_iterations": 20000}
+        rungs.append(_rung("linear", "linear solver", f"cg, {kind}", values))
+    return rungs + [
+        _rung("linear", "linear tolerance", f"linear tolerance {tolerance:g}", {"stepper.linear_tolerance": tolerance})
+        for tolerance in (1e-1, 1e-2, 1e-3, 1e-6)
+    ]
+
+
+def _contacts() -> list[Rung]:
+    options = {
+        "stiffness_N_mm3": (10, 30, 100, 300, 1000, 3000), "sample_spacing_mm": (6, 3, 1.5, 0.75),
+        "smoothing_mm": (0.1, 0.03, 0.01, 0.003), "friction_stiffness_ratio": (0.1, 0.5, 2),
+    }
+    return [
+        _rung("contact", f"contact {key}", f"contact {key} {value:g}", {f"contact.{key}": value})
+        for key, values in options.items() for value in values
+    ] + _others("contact", "contact", known=("penalty",))
+
+
+def _others(kind: str, knob: str, *, known: Sequence[str]) -> list[Rung]:
+    """Return a rung for each registered plugin of a kind that the ladder does not name itself."""
+    return [_rung(knob, knob, f"{kind} {name}", {kind: name}) for name in registry.names(kind) if name not in known]
+
+
+def _require_backend(rung: Rung) -> None:
+    from finqd.mechanics.linear_backends import available_backends
+
+    backend = rung.settings.get("stepper.backend")
+    if backend is not None and backend not in available_backends():
+        raise InputError(f"the library {backend} is not installed", rung.name)
+
+
+def _plain(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
