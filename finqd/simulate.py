@@ -53,6 +53,8 @@ class _Recorder:
             "newton_iterations": report.iterations, "line_search_steps": report.line_searches,
             "factorisations": report.factorisations, "cg_iterations": report.cg_iterations,
             "projections": report.projections, "friction_updates": report.friction_updates,
+            "error_rejections": report.error_rejections, "error_overruns": report.error_overruns,
+            "substeps": report.substeps,
         }
         for key, value in counted.items():
             self.counters[key] = self.counters.get(key, 0) + value
@@ -68,6 +70,46 @@ class _Recorder:
         )
 
 
+@dataclass(kw_only=True)
+class _StepControl:
+    """How long the next step is: halved where one fails, doubled when calm; or what the stepper proposes.
+
+    frame: longest step [s]; proposed: the stepper's own opinion [s], None as long as it has none
+    """
+
+    frame: float
+    halvings: int = 0
+    calm: int = 0
+    proposed: float | None = None
+
+    @property
+    def shortest(self) -> float:
+        return self.frame / 2**HALVINGS
+
+    def length(self, left: float) -> float:
+        """Return the next step [s], of ``left`` [s] to the end of the frame."""
+        if self.proposed is None:
+            return min(self.frame / 2**self.halvings, left)
+        # equal steps to the end of the frame, so that none is a remainder
+        return left / max(math.ceil(left / self.proposed * (1 - 1e-9)), 1)
+
+    def judge(self, report: StepReport, dt: float) -> bool:
+        """Take what a step of ``dt`` says; return whether to go on."""
+        if report.next_dt is not None:
+            if not report.converged and dt <= self.shortest * (1 + 1e-9):
+                return False
+            self.proposed = min(max(report.next_dt, self.shortest), self.frame)
+        elif report.converged:
+            self.calm += 1
+            if self.calm >= CALM_STEPS and self.halvings:
+                self.halvings, self.calm = self.halvings - 1, 0
+        elif self.halvings == HALVINGS:
+            return False
+        else:
+            self.halvings, self.calm = self.halvings + 1, 0
+        return True
+
+
 def simulate(
     scene: Scene, *, duration: float, time_step: float, stepper: Any = "implicit_euler", contact: Any = "penalty",
     record: bool = False, wall_clock_limit: float = math.inf, progress: Callable[[float], None] | None = None,
@@ -78,7 +120,9 @@ def simulate(
     stepper, contact: plugins or their names. record: keep soft positions of every frame (one a time step).
     progress: called with the share of time done; watch: called with the system and the state after every step.
     A step that fails is halved, up to 2^-8, then the run ends with status ``diverged``; a run that takes longer than
-    ``wall_clock_limit`` [s] ends with status ``timeout``. Raises InputError for numbers that make no sense.
+    ``wall_clock_limit`` [s] ends with status ``timeout``. A stepper that estimates its error chooses its steps itself,
+    within the same bounds; then ``time_step`` is only how often a frame is kept. Raises InputError for numbers that
+    make no sense.
     """
     for name, value in (("duration", duration), ("time_step", time_step)):
         if not (math.isfinite(value) and value > 0.0):
@@ -95,24 +139,19 @@ def simulate(
     set_up = clock.perf_counter() - begun
     status, reason = "ok", ""
     frames = max(round(duration / time_step), 1)
-    halvings, calm = 0, 0
+    control = _StepControl(frame=duration / frames)
+    system.shortest_step = control.shortest
     for frame in range(1, frames + 1):
         frame_end = duration * frame / frames
         while status == "ok" and state.time < frame_end * (1 - 1e-12):
-            dt = min(duration / frames / 2**halvings, frame_end - state.time)
+            dt = control.length(frame_end - state.time)
             state, report = stepper.step(system, state, dt)
             recorder.count(report)
             recorder.largest_penetration = max(recorder.largest_penetration, system.contact.penetration)
-            if report.converged:
-                calm += 1
-                if calm >= CALM_STEPS and halvings:
-                    halvings, calm = halvings - 1, 0
-                if watch is not None:
-                    watch(system, state)
-            elif halvings == HALVINGS:
+            if not control.judge(report, dt):
                 status, reason = "diverged", f"at t = {state.time:.4f} s, dt = {dt:.2g} s: {report.reason}"
-            else:
-                halvings, calm = halvings + 1, 0
+            elif report.converged and watch is not None:
+                watch(system, state)
             if status == "ok" and clock.perf_counter() - begun > wall_clock_limit:
                 status, reason = "timeout", f"at t = {state.time:.4f} s after {wall_clock_limit:g} s of computing"
         if status != "ok":

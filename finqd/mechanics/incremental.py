@@ -1,37 +1,124 @@
-"""The incremental potential of one implicit Euler step."""
+"""The incremental potential of one implicit step, for any formula that makes velocities of positions."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from finqd.mechanics.assembly_kernels import add_diagonal
-from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
+from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_matrix, rotation_vector
 from finqd.mechanics.state import Direction, State
 from finqd.mechanics.system import System
 
 
-class EulerIncrement:
-    r"""Inertia plus all potentials, whose minimum is the implicit Euler step (Ortiz and Stainier 1999).
+@dataclass(frozen=True, kw_only=True)
+class Past:
+    """What a step knows of the motion so far: in a backward formula, x = origin + h v and v = base + h a at its end.
 
-    Soft: m |x - x0 - dt v0|^2 / (2 dt^2) a vertex. Rigid: the same of the centre of mass, and
-    (t - dt w0)^T J (t - dt w0) / (2 dt^2) with the rotation vector t of the step, J the inertia at its start
-    and w0 = J^-1 L0; the new angular momentum is J t / dt, so that a free body keeps its own exactly.
+    h: effective step [s]; ratio: this step over the one before (0: that one is not used)
+    origin, inertial: where each soft vertex was, and would be without forces, origin + h base [m], (n_vertices, 3)
+    rigid_origin, rigid_inertial: the same of the rigid centres of mass [m], (n_rigid, 3)
+    turns: rotation vector since the step's start of each rigid body without torques [rad], (n_rigid, 3)
+    inertias: that weigh a rotation vector's distance from ``turns``, (n_rigid, 3, 3) [kg m^2]
+    momenta: base of the angular momenta [kg m^2/s], (n_rigid, 3); None: those at the end are ``inertias`` turn / h
     """
 
-    def __init__(self, system: System, state: State, dt: float) -> None:
-        self.system, self.start, self.dt = system, state, dt
+    h: float
+    ratio: float = 0.0
+    origin: np.ndarray
+    inertial: np.ndarray
+    rigid_origin: np.ndarray
+    rigid_inertial: np.ndarray
+    turns: np.ndarray
+    inertias: np.ndarray
+    momenta: np.ndarray | None = None
+
+
+def euler_past(system: System, state: State, dt: float) -> Past:
+    r"""Return the past as implicit Euler sees it: x = x0 + dt v, v = v0 + dt a.
+
+    Rigid bodies: J at the step's start, turns = dt J^-1 L0; the new angular momentum is J t / dt of the step's
+    rotation vector t, so that a free body keeps its own exactly.
+    """
+    inertias = system.world_inertias(state.rigid_rotations)
+    return Past(
+        h=dt, origin=state.positions, inertial=state.positions + dt * state.velocities,
+        rigid_origin=state.rigid_positions, rigid_inertial=state.rigid_positions + dt * state.rigid_velocities,
+        turns=_spins(system, inertias, state) * dt, inertias=inertias,
+    )
+
+
+def bdf2_coefficients(ratio: float) -> tuple[float, float, float]:
+    r"""Return (a, b, beta) of y1 = a y0 - b y_before + beta dt y1' with ratio = dt / dt_before.
+
+    a = (1 + w)^2 / (1 + 2 w), b = w^2 / (1 + 2 w), beta = (1 + w) / (1 + 2 w): 4/3, 1/3 and 2/3 for equal steps.
+    Source: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, III.5 (zero-stable for
+    w < 1 + sqrt 2); Celaya, Aguirrezabala and Chatzipantelidis, Procedia Computer Science 29 (2014) 1014.
+    """
+    w = ratio
+    return (1 + w) ** 2 / (1 + 2 * w), w * w / (1 + 2 * w), (1 + w) / (1 + 2 * w)
+
+
+def bdf2_past(system: System, state: State, dt: float) -> Past:
+    r"""Return the past as the variable-step BDF2 formula sees it, from ``state`` and ``state.previous``.
+
+    Rigid bodies: rotation vectors relative to the step's start, so that the body before has t_ = log(R_ R0^T). The
+    formula gives the rate (t + b t_) / h, h = beta dt, and the angular momentum I(t) T(t) times that rate, with T the
+    left Jacobian and I(t) the turned inertia. Both are taken at the rotation s = dt I0^-1 L0 that the body is about to
+    do, which is off by O(dt^2) and so costs O(dt^3) a step: with A = I(s) T(s) and the base L = a L0 - b L_, the
+    body without torques has t^ = h A^-1 L - b t_, and its energy is (t - t^)^T T(s)^T A (t - t^) / (2 h^2), whose
+    matrix is symmetric. Momenta grow by h times the torque exactly.
+    """
+    before = state.previous
+    ratio = dt / (state.time - before.time)
+    a, b, beta = bdf2_coefficients(ratio)
+    h = beta * dt
+    origin, rigid_origin = (a * now - b * then for now, then in (
+        (state.positions, before.positions), (state.rigid_positions, before.rigid_positions)))
+    base, rigid_base, momenta = (a * now - b * then for now, then in (
+        (state.velocities, before.velocities), (state.rigid_velocities, before.rigid_velocities),
+        (state.angular_momenta, before.angular_momenta)))
+    turns, inertias = np.zeros((system.n_rigid, 3)), np.zeros((system.n_rigid, 3, 3))
+    spins = dt * _spins(system, system.world_inertias(state.rigid_rotations), state)
+    for r, (spin, now, then) in enumerate(zip(spins, state.rigid_rotations, before.rigid_rotations, strict=True)):
+        left = np.linalg.inv(inverse_left_jacobian(spin))
+        turned = rotation_matrix(spin) @ now
+        a_matrix = turned @ system.rigid_inertias[r] @ turned.T @ left
+        turns[r] = h * np.linalg.solve(a_matrix, momenta[r]) - b * rotation_vector(then @ now.T)
+        inertias[r] = left.T @ a_matrix
+    return Past(
+        h=h, ratio=ratio, origin=origin, inertial=origin + h * base, rigid_origin=rigid_origin,
+        rigid_inertial=rigid_origin + h * rigid_base, turns=turns, inertias=inertias, momenta=momenta,
+    )
+
+
+def _spins(system: System, inertias: np.ndarray, state: State) -> np.ndarray:
+    """Return the angular velocities [rad/s] of the rigid bodies, shape (n_rigid, 3)."""
+    if not system.n_rigid:
+        return np.zeros((0, 3))
+    return np.linalg.solve(inertias, state.angular_momenta[:, :, None])[:, :, 0]
+
+
+class Increment:
+    r"""Inertia plus all potentials, whose minimum is the implicit step (Ortiz and Stainier 1999).
+
+    Soft: m |x - x^|^2 / (2 h^2) a vertex, x^ where it would be without forces and h the formula's effective step
+    (see `Past`). Rigid: the same of the centre of mass, and (t - t^)^T J (t - t^) / (2 h^2) with the rotation vector t
+    of the step. All forces are those at the end of the step, so contact and friction do not know which formula it is.
+    """
+
+    def __init__(
+        self, system: System, state: State, dt: float, past: Past, *, soft_inertia: bool = True, load_share: float = 1.0
+    ) -> None:
+        """soft_inertia: off, soft bodies are in equilibrium; load_share: of gravity and dead loads on soft bodies."""
+        self.system, self.start, self.dt, self.past = system, state, dt, past
         self.time = state.time + dt
         self.progress = system.advanced_progress(state, dt)
-        self.inertias = system.world_inertias(state.rigid_rotations)
-        self.inertial = state.positions + dt * state.velocities
-        self.rigid_inertial = state.rigid_positions + dt * state.rigid_velocities
-        self.spins = (
-            np.linalg.solve(self.inertias, state.angular_momenta[:, :, None])[:, :, 0] * dt if system.n_rigid else
-            np.zeros((0, 3))
-        )
-        self.vertex_weight = np.where(system.fixed, 0.0, (system.masses / dt**2)[:, None])
+        self.masses = system.masses if soft_inertia else np.zeros_like(system.masses)
+        self.vertex_weight = np.where(system.fixed, 0.0, (self.masses / past.h**2)[:, None])
+        #: loads that do not act yet [N], (n_vertices, 3); None: all do
+        self.withheld = None if load_share == 1.0 else (1.0 - load_share) * system.forces
         #: a typical energy [J], for the rounding of differences of energies
         self.scale = abs(system.energy(state))
 
@@ -42,15 +129,16 @@ class EulerIncrement:
         return candidates[1] if energies[1] < energies[0] else candidates[0]
 
     def _start(self, share: float) -> State:
+        start, system = self.start, self.system
+        spins = _spins(system, system.world_inertias(start.rigid_rotations), start) * self.dt
         direction = Direction(
-            soft=self.dt * self.start.velocities,
-            rigid=np.concatenate([self.dt * self.start.rigid_velocities, self.spins], axis=1),
+            soft=self.dt * start.velocities, rigid=np.concatenate([self.dt * start.rigid_velocities, spins], axis=1)
         )
         if share > 0.0:
-            share = min(share, self.system.contact.step_limit(self.start, direction))
-        moved = self.start.moved(direction, share)
-        positions = np.where(self.system.fixed, self.start.positions, moved.positions)
-        self.system.prescribe(positions, self.progress, self.time)
+            share = min(share, system.contact.step_limit(start, direction))
+        moved = start.moved(direction, share)
+        positions = np.where(system.fixed, start.positions, moved.positions)
+        system.prescribe(positions, self.progress, self.time)
         return replace(moved, positions=positions)
 
     def _turns(self, state: State) -> np.ndarray:
@@ -60,49 +148,66 @@ class EulerIncrement:
         return turns
 
     def _inertia_energy(self, state: State, turns: np.ndarray) -> float:
-        soft = np.vdot(self.vertex_weight, (state.positions - self.inertial) ** 2)
-        shift = state.rigid_positions - self.rigid_inertial
-        off = turns - self.spins
+        past = self.past
+        soft = np.vdot(self.vertex_weight, (state.positions - past.inertial) ** 2)
+        shift = state.rigid_positions - past.rigid_inertial
+        off = turns - past.turns
         rigid = np.vdot(self.system.rigid_masses, np.sum(shift**2, axis=1))
-        rigid += np.einsum("bi,bij,bj", off, self.inertias, off)
-        return 0.5 * soft + 0.5 * rigid / self.dt**2
+        rigid += np.einsum("bi,bij,bj", off, past.inertias, off)
+        return 0.5 * soft + 0.5 * rigid / past.h**2
+
+    def _withheld_energy(self, state: State) -> float:
+        return 0.0 if self.withheld is None else float(np.vdot(self.withheld, state.positions))
 
     def energy(self, state: State) -> float:
         """Return the incremental potential [J]."""
-        return self._inertia_energy(state, self._turns(state)) + self.system.energy(state)
+        energy = self._inertia_energy(state, self._turns(state)) + self.system.energy(state)
+        return energy + self._withheld_energy(state)
 
     def gradient(self, state: State) -> float:
         """Fill the gradient in the system's derivatives, zero where held; return the energy [J]."""
-        system, d = self.system, self.system.derivatives
+        system, d, past = self.system, self.system.derivatives, self.past
         d.clear_gradient()
         turns = self._turns(state)
         energy = system.add_gradient(state) + self._inertia_energy(state, turns)
-        d.soft += self.vertex_weight * (state.positions - self.inertial)
-        d.rigid[:, :3] += (system.rigid_masses / self.dt**2)[:, None] * (state.rigid_positions - self.rigid_inertial)
+        d.soft += self.vertex_weight * (state.positions - past.inertial)
+        if self.withheld is not None:
+            d.soft += self.withheld
+        d.rigid[:, :3] += (system.rigid_masses / past.h**2)[:, None] * (state.rigid_positions - past.rigid_inertial)
         for b, turn in enumerate(turns):
-            d.rigid[b, 3:] += inverse_left_jacobian(turn).T @ self.inertias[b] @ (turn - self.spins[b]) / self.dt**2
+            d.rigid[b, 3:] += inverse_left_jacobian(turn).T @ past.inertias[b] @ (turn - past.turns[b]) / past.h**2
         system.clear_held()
-        return energy
+        return energy + self._withheld_energy(state)
 
     def hessian(self, state: State, *, projected: bool = False) -> None:
         """Fill the Hessian in the system's derivatives, the identity where held."""
-        system, d, dt = self.system, self.system.derivatives, self.dt
+        system, d, h = self.system, self.system.derivatives, self.past.h
         d.clear_hessian()
         system.add_hessian(state, projected=projected)
-        add_diagonal(system.pattern.indptr, system.pattern.indices, system.masses / dt**2, d.blocks)
+        add_diagonal(system.pattern.indptr, system.pattern.indices, self.masses / h**2, d.blocks)
         for b, turn in enumerate(self._turns(state)):
             jacobian = inverse_left_jacobian(turn)
             body = slice(6 * b, 6 * b + 6)
-            d.rigid_matrix[body, body][:3, :3] += np.eye(3) * system.rigid_masses[b] / dt**2
-            d.rigid_matrix[body, body][3:, 3:] += jacobian.T @ self.inertias[b] @ jacobian / dt**2
+            d.rigid_matrix[body, body][:3, :3] += np.eye(3) * system.rigid_masses[b] / h**2
+            d.rigid_matrix[body, body][3:, 3:] += jacobian.T @ self.past.inertias[b] @ jacobian / h**2
         system.hold_fixed()
 
     def finished(self, trial: State) -> State:
-        """Return ``trial`` as the end of the step, with its velocities."""
-        dt, start = self.dt, self.start
+        """Return ``trial`` as the end of the step, with its velocities and the start as its ``previous``."""
+        past = self.past
         return replace(
             trial, time=self.time, progress=self.progress,
-            velocities=(trial.positions - start.positions) / dt,
-            rigid_velocities=(trial.rigid_positions - start.rigid_positions) / dt,
-            angular_momenta=np.einsum("bij,bj->bi", self.inertias, self._turns(trial)) / dt,
+            velocities=(trial.positions - past.origin) / past.h,
+            rigid_velocities=(trial.rigid_positions - past.rigid_origin) / past.h,
+            angular_momenta=self._momenta(self._turns(trial)),
+            previous=replace(self.start, previous=None),
         )
+
+    def _momenta(self, turns: np.ndarray) -> np.ndarray:
+        past = self.past
+        if past.momenta is None:
+            return np.einsum("bij,bj->bi", past.inertias, turns) / past.h
+        momenta = past.momenta.copy()
+        for b, turn in enumerate(turns):
+            momenta[b] += inverse_left_jacobian(turn).T @ past.inertias[b] @ (turn - past.turns[b]) / past.h
+        return momenta

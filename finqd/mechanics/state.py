@@ -66,6 +66,8 @@ class StepReport:
     residuals: the history over the iterations [N]
     error: estimate of the step's own error [m], NaN where the stepper makes none
     next_dt: how long the stepper would make the next step (or this one, tried again) [s], None if it has no opinion
+    error_rejections: 1 if only its error speaks against the step; error_overruns: 1 if it stands in spite of its error
+    substeps: how many shorter steps the stepper took inside this one
     """
 
     converged: bool = False
@@ -81,3 +83,6 @@ class StepReport:
     residuals: list[float] | None = None
     error: float = float("nan")
     next_dt: float | None = None
+    error_rejections: int = 0
+    error_overruns: int = 0
+    substeps: int = 0

@@ -50,6 +50,7 @@ class System:
     rigid_masses [kg], (n_rigid,); rigid_inertias: body frame [kg m^2], (n_rigid, 3, 3); rigid_forces [N], (n_rigid, 3)
     rigid_sizes: radius that turns a torque into a force for the residual [m], (n_rigid,)
     fixed: bool, (n_vertices, 3); rigid_held: bool, (n_rigid,)
+    shortest_step: [s] a step this short is not rejected for its error any more
     """
 
     def __init__(self, scene: Scene, *, contact: Contact) -> None:
@@ -77,6 +78,7 @@ class System:
             soft=np.zeros((n, 3)), rigid=np.zeros((m, 6)), blocks=np.zeros((self.pattern.n_blocks, 3, 3)),
             coupling=np.zeros((3 * n, 6 * m)), rigid_matrix=np.zeros((6 * m, 6 * m)),
         )
+        self.shortest_step = 0.0
         self.solvers: dict[tuple, object] = {}  # of the steppers, by their settings: they keep lagged factorisations
 
     @property

@@ -3,163 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
-import numpy as np
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Gt, Le
 
-from finqd.mechanics.incremental import EulerIncrement
-from finqd.mechanics.linear import LinearSolution, make_solver
-from finqd.mechanics.state import Direction, State, StepReport
+from finqd.mechanics.incremental import Increment, euler_past
+from finqd.mechanics.local_error import euler_error, judge
+from finqd.mechanics.newton import Newton, NewtonOptions
+from finqd.mechanics.state import State, StepReport
 from finqd.mechanics.system import System
-
-ARMIJO = 1e-4  # share of the linear decrease that a step must reach (Nocedal and Wright, Numerical Optimization, 3.1)
-LAG_FORCE = 0.1  # [N] what renewed contact may leave unbalanced at the end of a step,
-LAG_SHARE = 0.1  # or this share of the largest normal force on a body
-LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
-EARLY = 100.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
-SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
-ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
+from finqd.units import MM
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImplicitEuler:
+class ImplicitEuler(NewtonOptions):
     """First order implicit Euler: every step minimises inertia, elasticity, contact and friction by Newton's method.
 
-    tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step
-    max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal
-    max_friction_updates: how often the friction bounds are renewed within a step
-    friction_tolerance: share of the friction bounds that may change without a renewal
-    linear_solver, preconditioner, backend: see `finqd.mechanics.linear`
-    linear_tolerance: relative residual of the linear solves
-    linear_iterations: cap on CG iterations
+    error_tolerance_mm: local error of a step, above which it is shortened; None: steps are as long as they converge
+    All other options: see `finqd.mechanics.newton.NewtonOptions`.
     """
 
-    tolerance_N: Annotated[float, Gt(0), Le(1)] = 5e-5
-    max_iterations: Annotated[int, Ge(1), Le(1000)] = 25
-    max_friction_updates: Annotated[int, Ge(0), Le(100)] = 3
-    friction_tolerance: Annotated[float, Gt(0), Le(1)] = 0.02
-    linear_solver: Literal["cg", "direct"] = "cg"
-    preconditioner: Literal["factorisation", "block_jacobi", "jacobi"] = "factorisation"
-    backend: Literal["auto", "pardiso", "cholmod", "qdldl", "superlu"] = "auto"
-    linear_tolerance: Annotated[float, Gt(0), Lt(1)] = 1e-3
-    linear_iterations: Annotated[int, Ge(1), Le(1_000_000)] = 1000
+    error_tolerance_mm: Annotated[float, Gt(0), Le(100)] | None = None
 
     def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:
         """Return the state after ``dt`` [s], or ``state`` itself and the reason."""
         report = StepReport(residuals=[])
         system.contact.begin_step(state)
-        increment = EulerIncrement(system, state, dt)
-        trial = self._minimise(system, increment, increment.predicted(), report)
+        increment = Increment(system, state, dt, euler_past(system, state, dt))
+        newton = Newton(system=system, increment=increment, options=self, report=report)
+        trial = newton.minimise(increment.predicted())
+        tolerance = None if self.error_tolerance_mm is None else self.error_tolerance_mm * MM
         if not report.converged:
+            report.next_dt = None if tolerance is None else 0.5 * dt
             return state, report
         end = increment.finished(trial)
+        error = euler_error(system, state, end)
+        if not judge(report, error, tolerance=tolerance, order=1, dt=dt, shortest=system.shortest_step):
+            return state, report
         system.contact.commit(end)
         return end, report
-
-    def _minimise(self, system: System, increment: EulerIncrement, trial: State, report: StepReport) -> State:
-        """Run Newton's method from ``trial``, renewing what contact lags; ``report`` says how it went."""
-        energy = increment.gradient(trial)
-        report.residual, report.where = system.residual()
-        early, best, best_jump = True, None, np.inf
-        while True:
-            report.residuals.append(report.residual)
-            if not (np.isfinite(report.residual) and np.isfinite(energy)):
-                report.reason = f"the forces are no longer finite ({report.where})"
-                break
-            # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
-            least = self.tolerance_N if report.iterations else 1e-3 * self.tolerance_N
-            done = report.residual <= least
-            if done and system.contact.strain(trial) > 1.0:
-                report.reason = "edges slid too far over soft faces in one step"
-                return trial
-            if done or (early and report.iterations and report.residual <= EARLY * self.tolerance_N):
-                early = False
-                change = system.contact.relag(trial)
-                report.friction_updates += 1
-                energy = increment.gradient(trial)
-                report.residual, report.where = system.residual()
-                progress = report.residual < LAG_PROGRESS * best_jump
-                if done and report.residual < best_jump:
-                    best, best_jump = trial, report.residual
-                steady = change <= self.friction_tolerance and report.residual <= LAG_FORCE
-                still = report.residual <= self.tolerance_N or steady
-                if done and (still or not progress or report.friction_updates > self.max_friction_updates):
-                    break
-                continue
-            if report.iterations >= self.max_iterations * (1 + report.friction_updates):
-                left = f"{report.residual:.3g} N left on {report.where}"
-                report.reason = f"no equilibrium after {report.iterations} iterations: {left}"
-                break
-            report.iterations += 1
-            moved = self._iterate(system, increment, trial, energy, report)
-            if moved is None:
-                break
-            trial = moved
-            energy = increment.gradient(trial)
-            report.residual, report.where = system.residual()
-        return trial if best is None else self._accept(system, best, best_jump, report)
-
-    def _accept(self, system: System, best: State, jump: float, report: StepReport) -> State:
-        """End the step with the state that renewed contact disturbed least, by ``jump`` [N], if that is little.
-
-        Contact geometry can jump between two faces of a dent for ever, and friction bounds lag; what is left then must
-        be small beside the contact forces, else the step was too long.
-        """
-        system.contact.relag(best)
-        bound = max(LAG_FORCE, LAG_SHARE * float(np.max(system.contact.relagged_forces, initial=0.0)))
-        report.converged, report.residual = jump <= bound, jump
-        if not report.converged:
-            report.reason = f"contact moved on too fast: {jump:.3g} N left on {report.where}"
-        return best
-
-    def _iterate(
-        self, system: System, increment: EulerIncrement, trial: State, energy: float, report: StepReport
-    ) -> State | None:
-        """Do one Newton iteration; None if no direction leads downhill."""
-        for projected in (False, True):
-            increment.hessian(trial, projected=projected)
-            solution = self._solve(system, report)
-            direction = Direction(soft=solution.soft, rigid=solution.rigid)
-            d = system.derivatives
-            slope = float(np.vdot(d.soft, direction.soft) + np.vdot(d.rigid, direction.rigid))
-            if solution.definite and slope < 0.0:
-                moved = self._search(system, increment, trial, energy, direction, slope, report)
-                if moved is not None:
-                    return moved
-            report.projections += 1
-        report.reason = f"the line search found no descent: {report.residual:.3g} N left on {report.where}"
-        return None
-
-    def _solve(self, system: System, report: StepReport) -> LinearSolution:
-        key = (self.linear_solver, self.preconditioner, self.backend, self.linear_iterations)
-        if key not in system.solvers:
-            system.solvers[key] = make_solver(
-                system.pattern, method=self.linear_solver, preconditioner=self.preconditioner, backend=self.backend,
-                max_iterations=self.linear_iterations, tolerance=self.linear_tolerance,
-            )
-        d = system.derivatives
-        solution = system.solvers[key].solve(
-            d.blocks, d.coupling, d.rigid_matrix, -d.soft, -d.rigid, tolerance=self.linear_tolerance
-        )
-        report.cg_iterations += solution.iterations
-        report.factorisations += int(solution.factorised)
-        return solution
-
-    def _search(
-        self, system: System, increment: EulerIncrement, trial: State, energy: float, direction: Direction,
-        slope: float, report: StepReport,
-    ) -> State | None:
-        """Backtrack until Armijo's condition holds, by the parabola through both energies and the slope."""
-        share = system.contact.step_limit(trial, direction)
-        slack = ROUNDING * (abs(energy) + increment.scale)
-        while share > SHORTEST:
-            moved = trial.moved(direction, share)
-            found = increment.energy(moved)
-            if found <= energy + ARMIJO * share * slope + slack:
-                return moved
-            report.line_searches += 1
-            curvature = found - energy - share * slope
-            best = -0.5 * slope * share * share / curvature if np.isfinite(curvature) and curvature > 0.0 else 0.0
-            share = min(max(best, 0.1 * share), 0.5 * share)
-        return None
