@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from finqd.errors import MeshError
-from finqd.mechanics.elements import Element, element, element_rule
+from finqd.mechanics.elements import Element, Rule, element, element_rule
 
 CHUNK = 1000  # elements handled at once: keeps the strain matrices of a large mesh out of memory
 
-HEX20_SHARE = 1e-3  # of the 3 x 3 x 3 rule: takes the six hourglass modes of the reduced one off zero
+HEX20_SHARE = 3e-3  # of the shear modulus: takes the six hourglass modes of the reduced rule off zero
 
 #: pair of axes of each Voigt component
 VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
@@ -45,8 +45,8 @@ def rest_elements(name: str, vertices: np.ndarray, lame: tuple[float, float]) ->
     """Return stiffness, mean gradients and volumes of elements of type ``name`` with rest nodes (n, k, 3) [m].
 
     hex8: 2 x 2 x 2 points, nine incompatible modes 1 - xi_i^2 condensed. wedge6: mean dilatation in its triangles and
-    the three modes 1 - t^2. tet4: one point. tet10: four points. hex20: 2 x 2 x 2 points, and `HEX20_SHARE` of the
-    full rule.
+    the three modes 1 - t^2. tet4: one point. tet10: four points. hex20: 2 x 2 x 2 points with `consistent_gradients`,
+    and `hourglass_matrix`.
     Raises MeshError for an inverted element, InputError for an unknown type.
     """
     kind = element(name)
@@ -91,32 +91,78 @@ def strain_matrix(gradients: np.ndarray) -> np.ndarray:
 def _rest_chunk(
     kind: Element, vertices: np.ndarray, material: np.ndarray, start: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    gradients, weights = physical_gradients(kind, vertices, kind.points, kind.weights)
-    if not np.all(weights > 0):
-        bad = start + int(np.argmax(~np.all(weights > 0, axis=1)))
-        raise MeshError(f"element {bad} of block {kind.name} is inverted or flat")
+    gradients, weights = consistent_gradients(kind, vertices, start=start)
     volumes = weights.sum(axis=1)
     mean = np.einsum("nq,nqak->nak", weights, gradients) / volumes[:, None, None]
     b = strain_matrix(gradients)
     if kind.name == "hex8":
-        stiffness = _condensed(b, _mode_strains(kind, vertices, weights, (0, 1, 2)), material, weights)
+        stiffness = _condensed(b, strain_matrix(mode_gradients(kind, vertices, weights)), material, weights)
     elif kind.name == "wedge6":
-        modes = _mode_strains(kind, vertices, weights, (2,))
+        modes = strain_matrix(mode_gradients(kind, vertices, weights))
         stiffness = _condensed(
             _level_dilatation(b, weights), _level_dilatation(modes, weights), material, weights
         )
-    elif kind.name == "hex20":
-        stiffness = (1 - HEX20_SHARE) * _integral(b, b, material, weights)
-        stiffness += HEX20_SHARE * _full_hex20(kind, vertices, material)
     else:
         stiffness = _integral(b, b, material, weights)
+    if kind.name == "hex20":
+        n, k = vertices.shape[:2]
+        scalar = material[3, 3] * hourglass_matrix(kind, vertices, gradients, weights)
+        stiffness += np.einsum("nab,ij->naibj", scalar, np.eye(3)).reshape(n, 3 * k, 3 * k)
     return (stiffness + np.swapaxes(stiffness, 1, 2)) / 2, mean, volumes
 
 
-def _full_hex20(kind: Element, vertices: np.ndarray, material: np.ndarray) -> np.ndarray:
-    gradients, weights = physical_gradients(kind, vertices, *element_rule("hex20", 3))
-    b = strain_matrix(gradients)
-    return _integral(b, b, material, weights)
+def consistent_gradients(kind: Element, vertices: np.ndarray, *, start: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return dN_a/dX (n, q, k, 3) [1/m] and weights (n, q) [m^3] of the stiffness rule, right in their mean.
+
+    The patch test asks for sum_q w_q dN_a/dX(q) = int dN_a/dX dV. A reduced rule misses that in a distorted quadratic
+    element; there the gradients are shifted, all points alike, by what their mean lacks, and the weights scaled to the
+    exact volume. Uniform strains stay exact, as sum_a X_a dN_a/dX has the exact mean at every point already.
+    Source: Krongauz and Belytschko, Int. J. Numer. Methods Eng. 40 (1997) 4215 (corrected derivatives); the exact means
+    come from a rule of degree 5 (hex20) or 3 (tet10), which is enough for curved edges too.
+    ``start``: number of the first element. Raises MeshError for an inverted one.
+    """
+    gradients, weights = physical_gradients(kind, vertices, kind.points, kind.weights)
+    right = weights > 0
+    if kind.quadratic:
+        exact, volumes = physical_gradients(kind, vertices, *exact_rule(kind))
+        right = np.concatenate([right, volumes > 0], axis=1)
+    if not np.all(right):
+        bad = start + int(np.argmax(~np.all(right, axis=1)))
+        raise MeshError(f"element {bad} of block {kind.name} is inverted or flat")
+    if kind.quadratic:
+        total = volumes.sum(axis=1)
+        weights = weights * (total / weights.sum(axis=1))[:, None]
+        lacking = _weighted(volumes, exact) - _weighted(weights, gradients)
+        gradients = gradients + (lacking / total[:, None, None])[:, None]
+    return gradients, weights
+
+
+def exact_rule(kind: Element) -> Rule:
+    """Return a rule that integrates dN_a/dX of a quadratic element exactly, curved or not."""
+    return element_rule(kind.name, 3 if kind.name.startswith("hex") else 2)
+
+
+def _weighted(weights: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """Return sum_q w_q g_a(q), shape (n, k, 3)."""
+    return np.einsum("nq,nqak->nak", weights, gradients)
+
+
+def hourglass_matrix(kind: Element, vertices: np.ndarray, gradients: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return S (n, k, k) [m]: the energy mu/2 sum_ab S_ab x_a . x_b stiffens what a hex20's reduced rule does not see.
+
+    S = `HEX20_SHARE` (L_full - L_reduced)+, L the Laplacian's matrix int dN_a/dX . dN_b/dX by the full and the reduced
+    rule, + the positive part. Both rules agree on linear fields (and, in a brick, on quadratic ones), so S annihilates
+    them: no force on a patch, and, at any strain, none on a rotation. Constant, so that large strain laws share it.
+    """
+    full, volumes = physical_gradients(kind, vertices, *exact_rule(kind))
+
+    def laplacian(g: np.ndarray, w: np.ndarray) -> np.ndarray:
+        flat = np.moveaxis(g, 2, 1).reshape(len(g), kind.n_nodes, -1)
+        return np.matmul(flat * np.repeat(w, 3, axis=1)[:, None], np.swapaxes(flat, 1, 2))
+
+    values, vectors = np.linalg.eigh(laplacian(full, volumes) - laplacian(gradients, weights))
+    positive = np.where(values > 1e-9 * values[:, -1:], values, 0.0)
+    return HEX20_SHARE * np.matmul(vectors * positive[:, None], np.swapaxes(vectors, 1, 2))
 
 
 def _integral(left: np.ndarray, right: np.ndarray, material: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -127,12 +173,18 @@ def _integral(left: np.ndarray, right: np.ndarray, material: np.ndarray, weights
     return np.matmul(np.swapaxes(flat, 1, 2), stress.reshape(n, q * 6, columns))
 
 
-def _mode_strains(kind: Element, vertices: np.ndarray, weights: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
-    """Return B (n, q, 6, 3 * len(axes)) of the incompatible modes 1 - xi_i^2, i in ``axes``, in each displacement.
+#: local axes i of the incompatible modes 1 - xi_i^2 of an element type
+MODE_AXES = {"hex8": (0, 1, 2), "wedge6": (2,)}
+
+
+def mode_gradients(kind: Element, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the gradients (n, q, m, 3) [1/m] of the incompatible modes 1 - xi_i^2, i in `MODE_AXES`, at the points.
 
     d/dX = (j0 / j) J0^-T d/dxi with the Jacobian at the centre, so that each mode's strain has no mean and the patch
     test passes. Source: Taylor, Beresford and Wilson, Int. J. Numer. Methods Eng. 10 (1976) 1211.
+    weights: w det J at the element's own points [m^3], (n, q)
     """
+    axes = MODE_AXES.get(kind.name, ())
     centre = kind.nodes.mean(axis=0)
     jacobian = np.einsum("nai,aj->nij", vertices, kind.shape_gradients(centre[None])[0])
     inverse, determinant = _inverse(jacobian)
@@ -140,7 +192,7 @@ def _mode_strains(kind: Element, vertices: np.ndarray, weights: np.ndarray, axes
     for column, axis in enumerate(axes):
         local[:, column, axis] = -2 * kind.points[:, axis]
     ratio = determinant[:, None] * kind.weights / weights  # j0 / j, as weights hold w j
-    return strain_matrix(np.matmul(local[None], inverse[:, None]) * ratio[:, :, None, None])
+    return np.matmul(local[None], inverse[:, None]) * ratio[:, :, None, None]
 
 
 def _level_dilatation(b: np.ndarray, weights: np.ndarray) -> np.ndarray:
