@@ -33,15 +33,25 @@ def accuracy(design: Design, preset: str) -> dict[str, Any]:
     ``sentence``, if the design departs from the preset, is of a kind that was not studied, or the preset is not
     measured (or has changed since).
     """
-    file = bands()
-    row = file["presets"].get(preset, {})
-    numbers = {key: row.get(key) for key in MEASURED}
-    objection = _objection(design, preset, row, numbers, file["valid_for"])
+    file, numbers = bands(), measured(preset)
+    objection = _unmeasured(preset, numbers) or _objection(design, preset, file["valid_for"])
     studies = {MEASURED[key] for key, value in numbers.items() if value is not None}
     return {
         "preset": preset, "applies": objection is None, "sentence": objection or _summary(numbers), **numbers,
         "studies": {name: dict(file["studies"][name]) for name in sorted(studies)},
     }
+
+
+def measured(preset: str) -> dict[str, float | None]:
+    """Return the measured numbers of a preset, None where there is none."""
+    row = bands()["presets"].get(preset, {})
+    return {key: row.get(key) for key in MEASURED}
+
+
+def preset_sentence(preset: str) -> str:
+    """Return what is measured of a preset where it is used as it is, in one sentence."""
+    numbers = measured(preset)
+    return _unmeasured(preset, numbers) or _summary(numbers)
 
 
 @lru_cache(maxsize=1)
@@ -57,14 +67,16 @@ def bands() -> Mapping[str, Any]:
     return document
 
 
-def _objection(
-    design: Design, preset: str, row: Mapping[str, Any], numbers: Mapping[str, Any], valid_for: Mapping[str, Any]
-) -> str | None:
-    """Return why the numbers say nothing of this design, or None."""
+def _unmeasured(preset: str, numbers: Mapping[str, Any]) -> str | None:
+    """Return why there are no numbers of the preset as it is now, or None."""
     if all(value is None for value in numbers.values()):
         return NOT_MEASURED
-    if row.get("settings") != PRESETS[preset]:
-        return f"{NOT_MEASURED}: the preset has changed since its study"
+    changed = bands()["presets"][preset].get("settings") != PRESETS[preset]
+    return f"{NOT_MEASURED}: the preset has changed since its study" if changed else None
+
+
+def _objection(design: Design, preset: str, valid_for: Mapping[str, Any]) -> str | None:
+    """Return why the numbers say nothing of this design, or None."""
     resolved = design.resolved()
     if resolved["geometry"]["name"] != valid_for["geometry"]:
         return f"does not apply: measured on fingers of the type {valid_for['geometry']}"

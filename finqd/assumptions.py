@@ -1,6 +1,13 @@
 """What every result of a grasp says of itself: which effects were on, and what was assumed."""
 
-#: effect -> on or off, and why
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from finqd.design import Design
+
+#: effect -> on or off, and why, with the plugins that a design has by default
 EFFECTS = {
     "object_contact": "on: always",
     "friction": "on: always",
@@ -15,6 +22,22 @@ EFFECTS = {
     "finger_to_finger_contact": "off: not built yet, fingers pass through each other",
     "soft_object": "off: objects are rigid",
 }
+
+
+def effects_of(design: Design) -> dict[str, str]:
+    """Return effect -> on or off, and why, of a design's simulations.
+
+    A plugin for elasticity, stepper or contact that does otherwise than the default ones says so in a class variable
+    ``effects``, a mapping of the same kind; an elasticity may declare ``small_rotation`` instead.
+    """
+    found = dict(EFFECTS)
+    for kind in ("elasticity", "stepper", "contact"):
+        plugin = design.plugin(kind)
+        if getattr(plugin, "small_rotation", False):
+            found["large_rotation"] = f"off: the elasticity {design.spec(kind)['name']} is for small rotations only"
+        found.update(getattr(plugin, "effects", {}))
+    return found
+
 
 #: finqd's own choices where the paper gives none
 ASSUMPTIONS = (

@@ -83,23 +83,28 @@ _set_option = click.option(
 @_set_option
 @click.option("--record", type=click.Path(path_type=Path), metavar="DIR",
               help="Keep the trajectories there, readable by ParaView.")
+@click.option("--estimate-error", is_flag=True,
+              help="Simulate again with a coarser mesh and with longer steps, and say how far off the result is.")
 @click.option("--quiet", is_flag=True, help="Print nothing but what goes wrong.")
 def evaluate(
     design: str, object_names: tuple[str, ...], surfaces: tuple[str, ...], mass_g: float | None, out: Path | None,
-    jobs: int, preset: str, settings: tuple[str, ...], record: Path | None, quiet: bool,
+    jobs: int, preset: str, settings: tuple[str, ...], record: Path | None, estimate_error: bool, quiet: bool,
 ) -> None:
     """Build a gripper, close it on every object in a simulation, and say which it holds."""
     from finqd.cli_files import usable_folder, written_at_end
     from finqd.cli_progress import shown_progress
     from finqd.cli_tables import print_evaluation
 
-    chosen = _read_design(design, settings)
+    chosen = _read_design(design, settings, preset)
     objects = [*_split(object_names), *_read_surfaces(surfaces, mass_g)] or None
     with written_at_end(out, "--out") as write, shown_progress(quiet=quiet) as progress:
         folder = usable_folder(record, "--record")
         from finqd.evaluate import evaluate as run  # takes a second, so only when nothing is left to refuse
 
-        result = run(chosen, objects=objects, preset=preset, jobs=jobs, record=folder, progress=progress)
+        result = run(
+            chosen, objects=objects, preset=preset, jobs=jobs, record=folder, progress=progress,
+            estimate_error=estimate_error,
+        )
         write(json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     if not quiet:
         print_evaluation(result.to_dict())
@@ -165,6 +170,14 @@ def plugins(kind: str | None) -> None:
 
 
 @finqd.command()
+def presets() -> None:
+    """List the presets: what each sets, and how far off it has been measured to be."""
+    from finqd.cli_tables import print_presets
+
+    print_presets()
+
+
+@finqd.command()
 def objects() -> None:
     """List the objects that come with finqd."""
     from finqd.cli_tables import print_objects
@@ -191,13 +204,20 @@ def doctor() -> int:
     return 0 if fit(findings) else 1
 
 
-def _read_design(text: str, settings: Sequence[str] = ()) -> Any:
-    """Return the design that DESIGN and ``--set`` mean, and warn of values that a search would not try."""
+def _read_design(text: str, settings: Sequence[str] = (), preset: str | None = None) -> Any:
+    """Return the design that DESIGN and ``--set`` mean, and warn of values that a search would not try.
+
+    With a ``preset``, which may choose plugins, ``--set`` changes the options of those.
+    """
     from finqd.design import Design, parse_setting
 
-    design = Design.from_json(_find_design(text))
-    if settings:
-        design = design.with_overrides(dict(map(parse_setting, settings)), source="--set:")
+    design, changes = Design.from_json(_find_design(text)), dict(map(parse_setting, settings))
+    if changes and preset is not None:
+        from finqd.presets import apply_preset
+
+        design = apply_preset(design, preset, overrides=changes, source="--set:")
+    elif changes:
+        design = design.with_overrides(changes, source="--set:")
     for warning in design.warnings:
         click.echo(f"finqd: warning: {_one_line(warning)}", err=True)
     return design

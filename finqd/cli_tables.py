@@ -28,11 +28,17 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
         "seconds>",
     )
     for name, row in objects.items():
+        estimate = row.get("estimate", {})
         verdict = "[green]yes[/green]" if row["held"] else "no"
         if row["status"] != "ok":
             verdict = f"[red]{escape(str(row['status']))}[/red]"
+        if estimate.get("uncertain"):
+            verdict += " [yellow](uncertain)[/yellow]"
+        drop = _number(row.get("drop_mm"), 2)
+        if estimate:
+            drop += f" +- {_number(estimate['drop_mm'][1], 2)}"
         table.add_row(
-            escape(name), verdict, _number(row.get("drop_mm"), 2), _number(row.get("margin"), 3),
+            escape(name), verdict, drop, _number(row.get("margin"), 3),
             _number(row.get("max_contact_force_N"), 2), _number(row.get("max_penetration_mm"), 4),
             _number(row.get("steps"), 0), _number(row.get("newton_iterations"), 0), _number(row.get("seconds"), 1),
         )
@@ -40,12 +46,54 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
     for name, row in objects.items():
         if row.get("reason"):
             console.print(f"{escape(name)}: {escape(str(row['reason']))}", soft_wrap=True)
+        elif row.get("estimate", {}).get("reason"):
+            console.print(f"{escape(name)}: uncertain: {escape(row['estimate']['reason'])}", soft_wrap=True)
     held = sum(bool(row["held"]) for row in objects.values())
     fitness, margin = _number(result["fitness"], 3), _number(result["margin"], 3)
     console.print(f"fitness {fitness} ({held} of {len(objects)} held), margin {margin}")
+    if "accuracy" in result:
+        accuracy = result["accuracy"]
+        line = f"accuracy of the preset {accuracy['preset']}: {accuracy['sentence']}"
+        console.print(escape(line), soft_wrap=True)
+    if "estimate" in result:
+        console.print(_estimate_line(result["estimate"]), soft_wrap=True)
     for part in ("features", "mesh", "effects", "timings", "assumptions"):
         _print_part(console, part, result.get(part))
     _print_part(console, "protocol", result.get("design", {}).get("protocol"))
+
+
+def _estimate_line(estimate: Mapping[str, Any]) -> str:
+    seconds = ", ".join(f"{name.replace('_', ' ')} {value:.1f} s" for name, value in estimate["seconds"].items())
+    uncertain = f"{estimate['uncertain']} of {estimate['objects']} verdicts are uncertain"
+    return f"error estimate: {uncertain}; simulated for: {seconds}"
+
+
+def print_presets() -> None:
+    """Print what each preset sets, and its measured errors."""
+    from finqd.accuracy_bands import bands, preset_sentence
+    from finqd.presets import PRESETS
+
+    console = _console()
+    for name, sections in PRESETS.items():
+        console.print(f"[bold]{name}[/bold]: {escape(preset_sentence(name))}")
+        for section, values in sections.items():
+            console.print(f"    {section}: {escape(_preset_section(values))}", soft_wrap=True)
+    for name, study in bands()["studies"].items():
+        if study["date"]:
+            line = f"{name} ({study['date']}): {study['title']}; to repeat it: {study['repeat']}"
+            console.print(escape(line), soft_wrap=True)
+
+
+def _preset_section(values: Mapping[str, Any]) -> str:
+    """Return options in a row, those of each plugin behind its name."""
+    parts = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            options = ", ".join(f"{option} = {_value(one)}" for option, one in value.items())
+            parts.append(f"{key} ({options})" if options else key)
+        else:
+            parts.append(f"{key} = {_value(value)}")
+    return ", or ".join(parts)
 
 
 def print_search(result: SearchResult) -> None:

@@ -6,14 +6,15 @@ import math
 import os
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from finqd.assumptions import ASSUMPTIONS, EFFECTS
+from finqd.accuracy_bands import accuracy
+from finqd.assumptions import ASSUMPTIONS, effects_of
 from finqd.contracts import FitnessResult
 from finqd.errors import FinqdError, InputError, MeshError
 from finqd.grasp import GraspTask, base_height, simulate_grasp
@@ -26,6 +27,7 @@ from finqd.workers import TaskFailure, run_tasks
 
 if TYPE_CHECKING:
     from finqd.design import Design
+    from finqd.estimate import Estimate
     from finqd.mesh import Mesh
     from finqd.solid import Solid
 
@@ -39,8 +41,9 @@ class Evaluation:
     status: "ok", or "mesh_failed" if there was nothing to simulate; reason: one sentence then
     features: in the units that their names end in; trajectories: object name -> Trajectory
     object_assumptions: what had to be assumed of the objects, one sentence each
-    timings: wall-clock seconds; the only part, with each object's ``seconds``, that differs between equal runs.
-    "compile" is part of "simulation" (summed over processes): kernels compiled, or loaded from Numba's cache
+    timings: wall-clock seconds; the only part, with each object's ``seconds`` and the estimate's, that differs between
+    equal runs. "compile" is part of "simulation" (summed over processes): kernels compiled, or loaded from Numba's
+    cache. estimate: how far off the result is likely to be, if that was asked for
     """
 
     design: Design
@@ -53,6 +56,7 @@ class Evaluation:
     mesh: Mapping[str, Any]
     timings: Mapping[str, float] = field(compare=False)
     object_assumptions: tuple[str, ...] = ()
+    estimate: Estimate | None = None
 
     @property
     def fitness(self) -> float:
@@ -66,12 +70,14 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON holds it."""
+        estimate = {} if self.estimate is None else {"estimate": self.estimate.to_dict()}
         return {
             "format": "finqd result", "design": self.design.resolved(), "digest": self.design.digest(),
-            "preset": self.preset, "status": self.status, "reason": self.reason, "fitness": self.fitness,
-            "margin": self.margin, "features": dict(self.features),
+            "preset": self.preset, "accuracy": accuracy(self.design, self.preset), "status": self.status,
+            "reason": self.reason, "fitness": self.fitness, "margin": self.margin, **estimate,
+            "features": dict(self.features),
             "objects": {name: self._row(name, trajectory) for name, trajectory in self.trajectories.items()},
-            "mesh": dict(self.mesh), "timings": dict(self.timings), "effects": EFFECTS,
+            "mesh": dict(self.mesh), "timings": dict(self.timings), "effects": effects_of(self.design),
             "assumptions": [*ASSUMPTIONS, *self.object_assumptions, *self.design.warnings], "versions": versions(),
         }
 
@@ -79,6 +85,7 @@ class Evaluation:
         verdict = self.result.verdicts[name]
         forces, penetrations = trajectory.contact_forces, trajectory.penetrations
         simulated = bool(len(trajectory.times))
+        estimate = {} if self.estimate is None else {"estimate": self.estimate.objects[name].to_dict()}
         return {
             "status": trajectory.status, "reason": trajectory.reason, "held": verdict.held,
             "drop_mm": _finite(verdict.drop / MM), "margin": verdict.margin,
@@ -90,23 +97,24 @@ class Evaluation:
             "steps": trajectory.counters.get("steps", 0),
             "newton_iterations": trajectory.counters.get("newton_iterations", 0),
             "counters": dict(trajectory.counters),
-            "seconds": trajectory.timings.get("set_up", 0.0) + trajectory.timings.get("steps", 0.0),
+            "seconds": trajectory.timings.get("set_up", 0.0) + trajectory.timings.get("steps", 0.0), **estimate,
         }
 
 
 def evaluate(
     design: Design, *, objects: Sequence[str | Path | GraspObject] | None = None, preset: str = "standard",
     overrides: Mapping[str, Any] | None = None, jobs: int = 1, record: Path | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Callable[[str, float], None] | None = None, estimate_error: bool = False,
 ) -> Evaluation:
     """Build ``design``, mesh it, close it on every object (default: the ten that come with finqd), and score it.
 
     overrides: design values by JSON path, stronger than ``preset``; jobs: grasps side by side; record: folder for
-    ParaView files; progress: called with object name and share done. Raises InputError for bad input; whatever
-    fails in mesh or simulation is in the result.
+    ParaView files; progress: called with object name and share done; estimate_error: simulate again one level away in
+    mesh and in time step, and say how far off the result is (`finqd.estimate`). Raises InputError for bad input;
+    whatever fails in mesh or simulation is in the result.
     """
     begun = clock.perf_counter()
-    chosen = apply_preset(design.with_overrides(overrides) if overrides else design, preset)
+    chosen = apply_preset(design, preset, overrides=overrides)
     grasped = load_objects(objects)
     solids = [chosen.plugin("geometry").build(chosen.finger_si(i)) for i in range(len(chosen.fingers))]
     features: dict[str, float] = {}
@@ -123,17 +131,33 @@ def evaluate(
     timings["mesh"] = clock.perf_counter() - meshed
     simulated = clock.perf_counter()
     if status == "ok":
-        trajectories = _simulated(chosen, meshes, grasped, jobs=jobs, record=record, progress=progress)
+        tasks = [GraspTask(design=chosen, meshes=meshes, grasped=g, record=record is not None) for g in grasped]
+        found = run_grasps(tasks, jobs=jobs, record=record, progress=progress)
+        trajectories = {g.name: trajectory for g, trajectory in zip(grasped, found, strict=True)}
     else:
         trajectories = {g.name: Trajectory(status=status, reason=reason, protocol=chosen.protocol) for g in grasped}
     timings["simulation"] = clock.perf_counter() - simulated
     timings["compile"] = sum(t.timings.get("compile", 0.0) for t in trajectories.values())
     timings["total"] = clock.perf_counter() - begun
-    return Evaluation(
+    evaluation = Evaluation(
         design=chosen, preset=preset, status=status, reason=reason, result=chosen.plugin("fitness").score(trajectories),
         features=features, trajectories=trajectories, mesh=mesh, timings=timings,
         object_assumptions=tuple(sentence for g in grasped for sentence in g.assumptions),
     )
+    return _with_estimate(evaluation, grasped, jobs=jobs, progress=progress) if estimate_error else evaluation
+
+
+def _with_estimate(
+    evaluation: Evaluation, grasped: Sequence[GraspObject], *, jobs: int,
+    progress: Callable[[str, float], None] | None,
+) -> Evaluation:
+    from finqd.estimate import estimate_error
+
+    begun = clock.perf_counter()
+    estimate = estimate_error(evaluation, objects=grasped, jobs=jobs, progress=progress)
+    took = clock.perf_counter() - begun
+    timings = {**evaluation.timings, "estimate": took, "total": evaluation.timings["total"] + took}
+    return replace(evaluation, estimate=estimate, timings=timings)
 
 
 def load_objects(objects: Sequence[str | Path | GraspObject] | None) -> list[GraspObject]:
@@ -170,15 +194,20 @@ def describe_meshes(meshes: Sequence[Mesh], design: Design) -> dict[str, Any]:
     }
 
 
-def _simulated(
-    design: Design, meshes: tuple[Mesh, ...], grasped: Sequence[GraspObject], *, jobs: int, record: Path | None,
-    progress: Callable[[str, float], None] | None,
-) -> dict[str, Trajectory]:
-    tasks = [GraspTask(design=design, meshes=meshes, grasped=g, record=record is not None) for g in grasped]
+def run_grasps(
+    tasks: Sequence[GraspTask], *, labels: Sequence[str] | None = None, jobs: int = 1, record: Path | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> list[Trajectory]:
+    """Return the trajectory of each grasp; a simulation that fails is one with a status.
+
+    labels: what ``progress`` is told of, by default the names of the objects; jobs: grasps side by side; record: folder
+    for ParaView files. Raises what is no fault of the design's (``InputError``, a library that is missing).
+    """
+    shown = [task.grasped.name for task in tasks] if labels is None else labels
 
     def on_progress(index: int, share: float) -> None:
         if progress is not None:
-            progress(grasped[index].name, share)
+            progress(shown[index], share)
 
     def on_result(index: int, result: Any) -> None:
         if record is not None and isinstance(result, Trajectory) and len(result.times):
@@ -186,7 +215,7 @@ def _simulated(
         on_progress(index, 1.0)
 
     results = run_tasks(simulate_grasp, tasks, jobs=jobs, on_progress=on_progress, on_result=on_result)
-    return {g.name: _as_trajectory(r, design, g.name) for g, r in zip(grasped, results, strict=True)}
+    return [_as_trajectory(r, task.design, task.grasped.name) for r, task in zip(results, tasks, strict=True)]
 
 
 def _as_trajectory(result: Any, design: Design, name: str) -> Trajectory:

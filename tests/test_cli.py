@@ -47,8 +47,9 @@ class FakeEvaluate:
     def __init__(self):
         self.calls, self.error = [], None
 
-    def __call__(self, design, *, objects, preset, jobs, record, progress):
-        self.calls.append({"design": design, "objects": objects, "preset": preset, "jobs": jobs, "record": record})
+    def __call__(self, design, *, objects, preset, jobs, record, progress, estimate_error):
+        call = {"design": design, "objects": objects, "preset": preset, "jobs": jobs, "record": record}
+        self.calls.append({**call, "estimate_error": estimate_error})
         progress("sphere", 0.5)
         if self.error is not None:
             raise self.error
