@@ -143,7 +143,8 @@ CASES: dict[str, Case] = {
     "press": Case(
         name="press", title="one finger pressed 10 mm by a cylinder of 20 mm radius",
         quantities={
-            "force_N": Quantity(label="force at 10 mm", unit="N"), "half_force_N": Quantity(label="force at 5 mm", unit="N"),
+            "force_N": Quantity(label="force at 10 mm", unit="N"),
+            "half_force_N": Quantity(label="force at 5 mm", unit="N"),
             "energy_mJ": Quantity(label="elastic energy", unit="mJ"),
         },
         measure=measure_press, simulated_s=lambda design: PRESS_S, fingers=1, physics=("geometry", "material"),
@@ -164,7 +165,7 @@ CASES: dict[str, Case] = {
         },
         measure=measure_grasp, simulated_s=_grasp_seconds, fingers=3, physics=(*_GRIPPER, "fitness"),
     ),
-}  # fmt: skip
+}
 
 
 def case_options(case: Case, *, finger: int | None, grasped: str | None, design: Design) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class Rung:
     def applied(self, design: Design) -> Design:
         """Return the design that this rung computes. Raises ``InputError`` if something of it is not installed."""
         start = without_numerics(design) if self.bare else design
-        return apply_preset(start.with_overrides(self.settings, source=f"rung {self.name}:"), self.preset)
+        return apply_preset(start, self.preset, overrides=self.settings, source=f"rung {self.name}:")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +74,10 @@ def without_numerics(design: Design) -> Design:
     return Design({**document, **({"protocol": protocol} if protocol else {})}, design.source)
 
 
-def build_ladder(design: Design, *, knobs: Iterable[str] = ()) -> Ladder:
+def build_ladder(design: Design, *, knobs: Iterable[str] = (), frictionless: bool = False) -> Ladder:
     """Return every rung of the chosen knobs (default: all) that is installed; ``standard`` is always among them.
+
+    frictionless: without the rungs that change friction only
 
     Raises ``InputError`` for an unknown knob.
     """
@@ -86,7 +88,7 @@ def build_ladder(design: Design, *, knobs: Iterable[str] = ()) -> Ladder:
     rungs: list[Rung] = [base]
     missing: dict[str, str] = {}
     for rung in _all_rungs():
-        if rung.knob not in chosen or rung.name == base.name:
+        if rung.knob not in chosen or rung.name == base.name or (frictionless and "friction" in rung.name):
             continue
         try:
             rung.applied(design)

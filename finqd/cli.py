@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 import click
 
 from finqd import __version__
+from finqd.cli_accuracy import accuracy
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, InputError
 
@@ -202,6 +203,9 @@ def doctor() -> int:
     findings = examine()
     print_findings(findings)
     return 0 if fit(findings) else 1
+
+
+finqd.add_command(accuracy)
 
 
 def _read_design(text: str, settings: Sequence[str] = (), preset: str | None = None) -> Any:

@@ -1,0 +1,112 @@
+"""The picture of an accuracy study: error against seconds on logarithmic axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from finqd.accuracy import Row, Study, front
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DPI = 130
+INK, SOFT, FRONT, PRESET = "#222222", "#999999", "#111111", "#c1121f"
+#: a curve's colour says what is turned, its mark which of several it is
+COLOURS = {
+    "size": "#1f6f8b", "element": "#e07a1f", "step": "#2a9d4a", "adaptive": "#7fbf3f", "stepper": "#8e5bb5",
+    "newton": "#b58b00", "linear": "#5c7fd6", "contact": "#d1699b", "elasticity": "#7a5230",
+}
+MARKS = "osD^vP<>hX*pd"
+
+
+def draw(study: Study, path: Path) -> None:
+    """Write the picture: one curve a series, the Pareto front, the presets and the paper's setting by name."""
+    from matplotlib.figure import Figure  # without pyplot: no window system, nothing global
+
+    rows = [row for row in study.table() if row["status"] == "ok" and row["error_percent"] is not None]
+    figure = Figure(figsize=(12.5, 7.2), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set(xscale="log", yscale="log")
+    lowest = _lowest(study, rows)
+    for colour, mark, name, line in _curves(study, rows):
+        points = [(row["seconds"], max(abs(row["error_percent"]), lowest)) for row in line]
+        axes.plot(*zip(*points), color=colour, marker=mark, markersize=5.5, linewidth=1.3, alpha=0.85, label=name)
+    best = [(row["seconds"], max(row["resolved_percent"], lowest)) for row in front(rows)]
+    if best:
+        axes.plot(*zip(*best), color=FRONT, linewidth=5, alpha=0.22, solid_capstyle="round", label="Pareto front")
+    presets = {row["rung"]: row for row in rows if row["knob"] == "preset"}
+    _mark_presets(axes, presets, lowest)
+    _dress(axes, study)
+    figure.savefig(path, dpi=DPI)
+
+
+def _curves(study: Study, rows: Sequence[Row]) -> list[tuple[str, str, str, list[Row]]]:
+    """Return colour, mark, label and points of each series, in the ladder's order of knobs; settings from coarse on."""
+    series: dict[str, list[Row]] = {}
+    for row in rows:
+        if row["knob"] in COLOURS:
+            series.setdefault(row["series"], []).append(row)
+    drawn, used = [], dict.fromkeys(COLOURS, 0)
+    for name, line in sorted(series.items(), key=lambda item: list(COLOURS).index(item[1][0]["knob"])):
+        knob = line[0]["knob"]
+        drawn.append((COLOURS[knob], MARKS[used[knob] % len(MARKS)], name, sorted(line, key=_setting)))
+        used[knob] += 1
+    return drawn
+
+
+def _setting(row: Row) -> tuple[Any, ...]:
+    """Return the turned value itself, so that a curve runs along its knob; names in the order of their seconds."""
+    numbers = [v for v in row["settings"].values() if isinstance(v, (int, float)) and not isinstance(v, bool)]
+    names = any(isinstance(value, str) for value in row["settings"].values()) and not numbers
+    return (row["seconds"],) if names or row["knob"] == "linear" else tuple(-float(number) for number in numbers)
+
+
+def _lowest(study: Study, rows: Sequence[Row]) -> float:
+    """Return where the picture's floor is [%]: an error of nothing has no logarithm."""
+    floor = study.reference.uncertainty_percent if study.reference else 0.0
+    found = [abs(row["error_percent"]) for row in rows if abs(row["error_percent"]) > 0.0]
+    return max(0.3 * floor, 0.5 * min(found, default=1.0) if floor == 0.0 else 0.0, 1e-4)
+
+
+def _mark_presets(axes: Axes, presets: Mapping[str, Row], lowest: float) -> None:
+    above = True
+    for name, row in sorted(presets.items(), key=lambda item: item[1]["seconds"]):
+        point = (row["seconds"], max(abs(row["error_percent"]), lowest))
+        text = "the paper's setting" if name == "paper" else name
+        axes.plot(*point, marker="*", markersize=17, color=PRESET, markeredgecolor="white", linestyle="", zorder=9)
+        axes.annotate(
+            f"{text}\n{abs(row['error_percent']):.2g} %, {row['seconds']:.2g} s", point, xytext=(0, 16 if above else -16),
+            textcoords="offset points", ha="center", va="bottom" if above else "top", fontsize=9.5, fontweight="bold",
+            color=PRESET, zorder=10, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0},
+        )
+        above = not above
+
+
+def _dress(axes: Axes, study: Study) -> None:
+    from matplotlib.ticker import FuncFormatter
+
+    quantity = study.case.quantities[study.case.main]
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_major_formatter(plain)
+    axes.yaxis.set_major_formatter(plain)
+    axes.set_xlabel("seconds on one core (without meshing and compiling)", color=INK)
+    axes.set_ylabel(f"error of the {quantity.label} [%]", color=INK)
+    axes.set_title(f"{study.case.title}: {study.design.name}", fontsize=12, color=INK)
+    if study.reference and study.reference.uncertainty_percent > 0.0:
+        axes.axhspan(1e-9, study.reference.uncertainty_percent, color=SOFT, alpha=0.18, zorder=0)
+        axes.text(
+            0.995, study.reference.uncertainty_percent, "the reference is no surer than this ", fontsize=8.5,
+            color=INK, ha="right", va="top", transform=axes.get_yaxis_transform(),
+        )
+        low, high = axes.get_ylim()
+        axes.set_ylim(max(low, 0.2 * study.reference.uncertainty_percent), high)
+    axes.grid(which="major", color="#dddddd", linewidth=0.7)
+    axes.grid(which="minor", color="#eeeeee", linewidth=0.4)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(0.07, 0.1)
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        axes.legend(handles, labels, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)

@@ -1,0 +1,138 @@
+"""What errors are measured against: the finest rungs of two element families, which must agree.
+
+A reference that ships with finqd is a file ``studies/reference_*.json``; the same file is what a study leaves in its
+folder, so anybody can repeat it, compare, and put another one there.
+"""
+
+from __future__ import annotations
+
+import json
+import time as clock
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from finqd.accuracy_cases import Case, Quantity
+from finqd.data import studies_folder
+from finqd.errors import InputError
+from finqd.json_input import read_json_object
+
+FORMAT = "finqd accuracy reference"
+AGREEMENT_PERCENT = 1.0  # two families that differ by more are no agreement
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """Converged values of a case, and where they come from.
+
+    physics: hash of what the values depend on (`finqd.accuracy.Study.physics`); values: key -> mean of the families
+    families: what each gave: rung, options, status, values, seconds, dofs, steps
+    difference_percent: between the families in the case's quantity, None if only one is there
+    source: "computed" by this study, or "shipped", or a file's name
+    """
+
+    case: str
+    physics: str
+    values: Mapping[str, Any]
+    families: Sequence[Mapping[str, Any]]
+    difference_percent: float | None
+    source: str = "computed"
+    design: str = ""
+    date: str = ""
+    repeat: str = ""
+    versions: Mapping[str, str]
+    machine: Mapping[str, Any]
+
+    @property
+    def uncertainty_percent(self) -> float:
+        """Half of what the two families differ by: errors below it are not told apart."""
+        return 0.5 * (self.difference_percent or 0.0)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether there are two families, within `AGREEMENT_PERCENT` of each other."""
+        return self.difference_percent is not None and self.difference_percent <= AGREEMENT_PERCENT
+
+    def sentence(self) -> str:
+        """Return what a reader has to know."""
+        names = " and ".join(str(family["rung"]) for family in self.families if family["status"] == "ok")
+        if self.difference_percent is None:
+            failed = "; ".join(f"{f['rung']}: {f['status']}" for f in self.families if f["status"] != "ok")
+            return f"reference by {names} alone ({failed}): nothing says how far off it is"
+        differ = f"{names} differ by {self.difference_percent:.2g} %"
+        floor = f"errors below {self.uncertainty_percent:.2g} % are not resolved"
+        verdict = "the reference is their mean" if self.agrees else "that is NO agreement; the reference is their mean"
+        return f"{differ}: {verdict}, and {floor}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as its file holds it."""
+        return {"format": FORMAT, **{key: value for key, value in asdict(self).items() if key != "source"}}
+
+
+def make_reference(
+    case: Case, physics: str, rows: Sequence[Mapping[str, Any] | None], *, full: bool
+) -> Reference | None:
+    """Return the reference of rows of two families, by the mean of those that worked; None if none did."""
+    done = [row for row in rows if row is not None and row["status"] == "ok"]
+    if not done:
+        return None
+    values: dict[str, Any] = {}
+    for key in case.quantities:
+        found = [row["values"][key] for row in done if key in row["values"]]
+        if found and isinstance(found[0], bool):
+            values.update({key: found[0]} if len(set(found)) == 1 else {})  # no verdict where the families disagree
+        elif found:
+            values[key] = sum(found) / len(found)
+    main = [row["values"][case.main] for row in done if case.main in row["values"]]
+    if not main:
+        return None
+    comparable = len(main) == 2 and values[case.main] != 0.0
+    difference = 100.0 * abs(main[0] - main[1]) / abs(values[case.main]) if comparable else None
+    keys = ("rung", "options", "status", "reason", "values", "seconds", "dofs", "steps", "newton_iterations")
+    families = [{key: row[key] for key in keys} for row in rows if row is not None]
+    first = done[0]
+    return Reference(
+        case=case.name, physics=physics, values=values, families=families, difference_percent=difference,
+        design=first["design"], date=clock.strftime("%Y-%m-%d", clock.gmtime()), versions=first["versions"],
+        machine=first["machine"],
+        repeat=f"finqd accuracy {case.name} --design {first['design']}{' --full' if full else ''} --reference compute",
+    )
+
+
+def shipped_reference(case: str, physics: str) -> Reference | None:
+    """Return the reference that ships with finqd for these physics, if there is one."""
+    for path in sorted(studies_folder().glob("reference_*.json")):
+        found = read_reference(path, source="shipped")
+        if (found.case, found.physics) == (case, physics):
+            return found
+    return None
+
+
+def read_reference(path: Path, *, source: str = "") -> Reference:
+    """Read a reference's file. Raises ``InputError`` if it is none."""
+    document, _ = read_json_object(path, kind="reference")
+    if document.pop("format", None) != FORMAT:
+        raise InputError("is no reference of an accuracy study", str(path))
+    try:
+        return Reference(**document, source=source or path.name)
+    except TypeError as error:
+        raise InputError("is no reference of this version of finqd", str(path)) from error
+
+
+def write_reference(path: Path, reference: Reference) -> None:
+    """Write a reference's file, whole or not at all."""
+    from finqd.runlog import plain, write_whole
+
+    write_whole(path, json.dumps(plain(reference.to_dict()), indent=2, ensure_ascii=False) + "\n")
+
+
+def error_of(quantity: Quantity, value: Any, exact: Any) -> float | None:
+    """Return the signed error: in percent where the quantity is relative, else in its unit; a verdict's is 0 or 1."""
+    if value is None or exact is None:
+        return None
+    if isinstance(value, bool):
+        return float(value != exact)
+    if quantity.relative:
+        return 100.0 * (value / exact - 1.0) if exact else None
+    return value - exact
