@@ -249,8 +249,8 @@ def _companion(
     trajectory = others.get((level.name, name), Trajectory(status="not_run", reason=level.reason))
     if level.name != STEP_LEVEL:
         return Companion(level=level.name, trajectory=trajectory, ratio=level.ratio, order=MESH_ORDER)
-    steps = trajectory.counters.get("steps", 0)
-    ratio = min(base.counters.get("steps", 0) / steps, STEP_FACTOR) if steps else math.nan
+    steps = _steps(trajectory)
+    ratio = min(_steps(base) / steps, STEP_FACTOR) if steps else math.nan
     return Companion(level=level.name, trajectory=trajectory, ratio=ratio, order=STEP_ORDER)
 
 
@@ -274,6 +274,11 @@ def _force(trajectory: Trajectory) -> float:
 
 def _seconds(trajectory: Trajectory) -> float:
     return trajectory.timings.get("set_up", 0.0) + trajectory.timings.get("steps", 0.0)
+
+
+def _steps(trajectory: Trajectory) -> int:
+    """Return the number of steps; an explicit stepper divides what it is asked for into steps of its own."""
+    return trajectory.counters.get("substeps", 0) or trajectory.counters.get("steps", 0)
 
 
 def _finite(value: float) -> float | None:

@@ -1,0 +1,264 @@
+"""Do verdicts depend on the preset? Grasps with one preset against the same grasps with better ones, and the paper's.
+
+    python benchmarks/verdict_flips.py --log flips.jsonl [--budget-minutes 120] [--suites fine,reference,paper]
+
+Three suites of pairs, chosen before any of them was looked at (`SEED`):
+
+- fine: 10 Sobol designs x 10 objects, `standard` (with an error estimate) against `fine`;
+- reference: 20 of those pairs drawn at random, `standard` against `reference`;
+- paper: the benchmark design x 10 objects, `standard` against `paper`.
+
+The pairs of every suite are shuffled and the suites interleaved, so that whatever part of the study is done is an
+unbiased sample of the whole. Writes a line a grasp as it goes, and resumes from there; a line whose design or preset
+has changed since is not used. Prints flips, whether the estimate had flagged each, errors of force and drop, and what
+the better one costs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from finqd.data import designs_folder
+from finqd.design import Design, design_parameters
+from finqd.evaluate import evaluate
+from finqd.objects import object_names
+from finqd.presets import PRESETS, apply_preset
+from finqd.workers import TaskFailure, run_tasks
+
+SEED = 20
+DESIGNS = 10
+REFERENCE_PAIRS = 20
+SUITES = ("fine", "reference", "paper")
+FIRM_N = 0.5  # [N] relative errors of smaller forces say nothing
+QUANTILE = 90  # what the bands in studies/presets.json mean by an error: 90 % of grasps are nearer than that
+
+
+@dataclass(frozen=True, order=True)
+class Grasp:
+    """One simulation: a design by name, an object, a preset."""
+
+    design: str
+    grasped: str
+    preset: str
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A grasp with the preset under study, and the one it is compared with."""
+
+    suite: str
+    ours: Grasp
+    other: Grasp
+
+
+def designs() -> dict[str, Design]:
+    """Return the designs of the study by name."""
+    size = 2 ** math.ceil(math.log2(DESIGNS))  # Sobol points are balanced in powers of two
+    units = qmc.Sobol(len(design_parameters()), seed=0).random(size)[:DESIGNS]
+    found = {f"sobol {i}": Design.from_unit_vector(unit) for i, unit in enumerate(units)}
+    return {**found, "benchmark": Design.from_json(designs_folder() / "benchmark.json")}
+
+
+def pairs(preset: str, suites: list[str]) -> list[Pair]:
+    """Return all pairs of the suites, shuffled and interleaved; the choice depends on `SEED` alone."""
+    generator = np.random.default_rng(SEED)
+    sobol = [(f"sobol {i}", name) for i in range(DESIGNS) for name in sorted(object_names())]
+    chosen = {
+        "fine": [sobol[i] for i in generator.permutation(len(sobol))],
+        "reference": [sobol[i] for i in generator.permutation(len(sobol))[:REFERENCE_PAIRS]],
+        "paper": [("benchmark", str(name)) for name in generator.permutation(sorted(object_names()))],
+    }
+    placed = [
+        ((i + 0.5) / len(chosen[suite]), Pair(suite, Grasp(design, name, preset), Grasp(design, name, suite)))
+        for suite in suites for i, (design, name) in enumerate(chosen[suite])
+    ]
+    return [pair for _, pair in sorted(placed, key=lambda one: one[0])]
+
+
+def prepared(grasp: Grasp, design: Design, limit_s: float) -> Design:
+    """Return the design as it is simulated."""
+    return apply_preset(design, grasp.preset, overrides={"protocol.wall_clock_limit_s": limit_s})
+
+
+def simulate(task: tuple[Grasp, Design, bool, float]) -> dict[str, Any] | None:
+    """Simulate one grasp; return a row of the log, None if the time is up."""
+    grasp, design, estimated, deadline = task
+    if time.time() > deadline:
+        return None
+    evaluation = evaluate(design, objects=[grasp.grasped], preset=grasp.preset, estimate_error=estimated)
+    result = evaluation.to_dict()
+    row = result["objects"][grasp.grasped]
+    kept = {key: row[key] for key in ("status", "reason", "held", "drop_mm", "steps", "newton_iterations", "seconds")}
+    forces = row["final_contact_force_N"]
+    return {
+        "design": grasp.design, "object": grasp.grasped, "preset": grasp.preset, "digest": result["digest"], **kept,
+        "force_N": None if forces is None else sum(forces), "dofs": result["mesh"].get("dofs"),
+        "estimate": row.get("estimate"), "estimate_levels": result.get("estimate"), "versions": result["versions"],
+    }
+
+
+def key(row: dict[str, Any]) -> Grasp:
+    """Return the grasp that a row of the log is about."""
+    return Grasp(row["design"], row["object"], row["preset"])
+
+
+def read_log(log: Path, known: dict[str, Design], limit_s: float) -> dict[Grasp, dict[str, Any]]:
+    """Return the rows that still hold; a line that a kill cut short is left out."""
+    rows: dict[Grasp, dict[str, Any]] = {}
+    for text in log.read_text().splitlines() if log.exists() else []:
+        try:
+            row = json.loads(text)
+        except json.JSONDecodeError:
+            print("a damaged line of the log is left out", file=sys.stderr)
+            continue
+        grasp = key(row)
+        if row["digest"] == prepared(grasp, known[grasp.design], limit_s).digest():
+            rows[grasp] = row
+    return rows
+
+
+def run(arguments: argparse.Namespace, wanted: list[Pair]) -> dict[Grasp, dict[str, Any]]:
+    """Simulate what the log does not hold yet, until the time is up; return all rows."""
+    log, known = Path(arguments.log), designs()
+    rows = read_log(log, known, arguments.limit_s)
+    deadline = time.time() + 60.0 * arguments.budget_minutes
+    estimated = {pair.ours for pair in wanted if pair.suite != "paper"}
+    todo = dict.fromkeys(grasp for pair in wanted for grasp in (pair.ours, pair.other))
+    grasps = [g for g in todo if g not in rows or (g in estimated and rows[g]["estimate"] is None)]
+    tasks = [(g, prepared(g, known[g.design], arguments.limit_s), g in estimated, deadline) for g in grasps]
+
+    def on_result(index: int, row: Any) -> None:
+        if isinstance(row, TaskFailure):
+            print(f"{grasps[index]}: {row.kind}: {row.reason}", flush=True)
+        elif row is not None:
+            rows[key(row)] = row
+            with log.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+            print(f"{row['design']:10s} {row['object']:10s} {row['preset']:10s} {words(row)}", flush=True)
+
+    run_tasks(simulate, tasks, jobs=arguments.jobs, on_result=on_result)
+    return rows
+
+
+def words(row: dict[str, Any]) -> str:
+    """Return one grasp in words."""
+    verdict = row["status"] if row["status"] != "ok" else "held" if row["held"] else "lost"
+    mark = "?" if row["estimate"] and row["estimate"]["uncertain"] else " "
+    drop = "-" if row["drop_mm"] is None else f"{row['drop_mm']:.2f}"
+    force = "-" if row["force_N"] is None else f"{row['force_N']:.2f}"
+    return f"{verdict:5s}{mark} force {force:>6s} N  drop {drop:>6s} mm  {row['seconds']:7.1f} s"
+
+
+def done(wanted: list[Pair], suite: str, rows: dict[Grasp, Any]) -> Iterator[tuple[Pair, dict, dict]]:
+    """Yield the pairs of a suite of which both grasps are there."""
+    for pair in wanted:
+        if pair.suite == suite and pair.ours in rows and pair.other in rows:
+            yield pair, rows[pair.ours], rows[pair.other]
+
+
+def report(wanted: list[Pair], rows: dict[Grasp, dict[str, Any]]) -> None:
+    """Print each suite: flips, flags, errors, seconds."""
+    for suite in SUITES:
+        found = list(done(wanted, suite, rows))
+        if not found:
+            continue
+        total = sum(pair.suite == suite for pair in wanted)
+        print(f"\n{found[0][0].ours.preset} against {suite}: {len(found)} of {total} pairs")
+        report_flips(found)
+        report_errors(found)
+        if suite == "paper":
+            for pair, ours, other in found:
+                print(f"  {pair.ours.grasped:10s} {pair.ours.preset}: {words(ours)}   paper: {words(other)}")
+
+
+def report_flips(found: list[tuple[Pair, dict, dict]]) -> None:
+    """Print which verdicts differ, and which of them the estimate had flagged."""
+    flips = [(pair, ours, other) for pair, ours, other in found if ours["held"] != other["held"]]
+    low, high = wilson(len(flips), len(found))
+    share = 100 * len(flips) / len(found)
+    print(f"  verdict flips: {len(flips)}, {share:.1f} % (95 % interval {low:.1f} to {high:.1f})")
+    for pair, ours, other in flips:
+        print(f"    {pair.ours.design}, {pair.ours.grasped}: {words(ours)}   {pair.other.preset}: {words(other)}")
+        if ours["estimate"]:
+            print(f"      flagged: {ours['estimate']['reason'] or 'NOT FLAGGED'}")
+    estimated = [(ours, other) for _, ours, other in found if ours["estimate"]]
+    if estimated:
+        flagged = sum(ours["estimate"]["uncertain"] for ours, _ in estimated)
+        missed = sum(ours["held"] != other["held"] and not ours["estimate"]["uncertain"] for ours, other in estimated)
+        print(f"  flagged uncertain: {flagged} of {len(estimated)}; flips that were not flagged: {missed}")
+    failed = [(pair, row) for pair, *both in found for row in both if row["status"] not in ("ok", "no_room")]
+    for pair, row in failed:
+        print(f"  failed: {pair.ours.design}, {pair.ours.grasped}, {row['preset']}: {row['status']}: {row['reason']}")
+
+
+def report_errors(found: list[tuple[Pair, dict, dict]]) -> None:
+    """Print errors of force and drop where both hold the object, how they lie to the estimate, and the seconds."""
+    held = [(ours, other) for _, ours, other in found if ours["held"] and other["held"]]
+    forces = [(100 * abs(a["force_N"] / b["force_N"] - 1), a, b) for a, b in held if b["force_N"] > FIRM_N]
+    drops = [(abs(a["drop_mm"] - b["drop_mm"]), a, b) for a, b in held]
+    for name, errors, entry in (("force [%]", forces, "force_N"), ("drop [mm]", drops, "drop_mm")):
+        if not errors:
+            continue
+        values = np.array([error for error, _, _ in errors])
+        line = f"  {name} of {len(values)} held by both: median {np.median(values):.2f}, " \
+               f"{QUANTILE} % below {np.percentile(values, QUANTILE):.2f}, largest {values.max():.2f}"
+        spreads = [(abs(a[entry] - b[entry]), a["estimate"][entry][1]) for _, a, b in errors if a["estimate"]]
+        known = [(error, spread) for error, spread in spreads if spread is not None]
+        if known:
+            inside = sum(error <= spread for error, spread in known)
+            line += f"; within the estimated spread: {inside} of {len(known)}"
+        print(line)
+    ours = np.array([row["seconds"] for _, row, _ in found])
+    other = np.array([row["seconds"] for _, _, row in found])
+    ratios = other / np.maximum(ours, 1e-9)
+    print(f"  seconds a grasp: {ours.mean():.1f} and {other.mean():.1f}; "
+          f"ratio of the sums {other.sum() / ours.sum():.2f}, median ratio {np.median(ratios):.2f}")
+    costs = [row["estimate_levels"]["seconds"] for _, row, _ in found if row["estimate_levels"]]
+    if costs:
+        base = sum(cost["base"] for cost in costs)
+        extra = sum(value for cost in costs for name, value in cost.items() if name != "base")
+        print(f"  the estimate costs {extra / max(base, 1e-9):.2f} times the grasp itself")
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a share [%] (Wilson 1927)."""
+    z, share = 1.96, count / total
+    centre = (share + z * z / (2 * total)) / (1 + z * z / total)
+    half = z / (1 + z * z / total) * math.sqrt(share * (1 - share) / total + z * z / (4 * total * total))
+    return 100 * max(centre - half, 0.0), 100 * min(centre + half, 1.0)
+
+
+def main() -> None:
+    """Read the options, run, report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--log", required=True)
+    parser.add_argument("--preset", choices=tuple(PRESETS), default="standard", help="the one under study")
+    parser.add_argument("--suites", default=",".join(SUITES), help="some of fine, reference, paper")
+    parser.add_argument("--pairs", type=int, help="only that many, from the beginning of the interleaved order")
+    parser.add_argument("--budget-minutes", type=float, default=math.inf, help="no grasp starts later")
+    parser.add_argument("--limit-s", type=float, default=7200.0, help="a simulation is given up after that")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--report", action="store_true", help="only print what the log holds")
+    arguments = parser.parse_args()
+    suites = arguments.suites.split(",")
+    if not set(suites) <= set(SUITES):
+        parser.error(f"--suites: known are {', '.join(SUITES)}")
+    wanted = pairs(arguments.preset, suites)[: arguments.pairs]
+    if arguments.report:
+        arguments.budget_minutes = -1.0
+    report(wanted, run(arguments, wanted))
+
+
+if __name__ == "__main__":
+    main()
