@@ -59,7 +59,8 @@ def result() -> dict:
 def test_the_result_says_everything_and_is_json(result):
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert {"fitness", "margin", "features", "objects", "timings", "effects", "assumptions", "versions", "mesh",
-            "design", "digest", "preset", "status", "reason"} <= result.keys()
+            "design", "digest", "preset", "accuracy", "status", "reason"} <= result.keys()
+    assert result["accuracy"]["preset"] == "draft" and result["accuracy"]["sentence"]
     assert set(result["features"]) >= {"workspace_mm2", "volume_mm3", "finger_volume_mm3"}
     assert result["features"]["workspace_mm2"] == pytest.approx(2078.46, abs=0.01)
     assert list(result["objects"]) == list(OBJECTS)
