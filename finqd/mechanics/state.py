@@ -86,3 +86,8 @@ class StepReport:
     error_rejections: int = 0
     error_overruns: int = 0
     substeps: int = 0
+
+    def add_work(self, other: StepReport) -> None:
+        """Add what another attempt at the same step cost."""
+        for name in ("iterations", "line_searches", "factorisations", "cg_iterations", "projections", "friction_updates"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
