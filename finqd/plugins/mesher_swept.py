@@ -26,7 +26,8 @@ class Swept:
     """Quadrilaterals in a prism's profile, swept along its thickness: hexahedra, and wedges where triangles remain.
 
     ``size_mm``: edge length aimed at in the profile; ``layers``: elements along the thickness, null for
-    thickness / (1.25 size), at least 2; ``least_edges``: elements through a wall at least. A profile that comes in
+    thickness / (1.25 size), at least 2; ``least_edges``: elements through a wall at least; ``grading``: above 1, edges
+    shrink towards the notches between walls and ribs, with that exponent (patches only). A profile that comes in
     patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by interpolation, without
     wedges; any other by gmsh.
     """
@@ -34,6 +35,7 @@ class Swept:
     size_mm: Annotated[float, Ge(0.2), Le(50)] = 4.0
     layers: Annotated[int, Ge(1), Le(200)] | None = None
     least_edges: Annotated[int, Ge(1), Le(10)] = 1
+    grading: Annotated[float, Ge(1), Le(4)] = 1.0
 
     def mesh(self, solid: Solid) -> Mesh:
         """Return the mesh of ``solid``; raises ``MeshError`` (``finqd.contracts.Mesher``)."""
@@ -63,7 +65,7 @@ class Swept:
     def _from_patches(self, solid: Prism, patches: tuple[Patch, ...]) -> PlaneMesh | None:
         """Return the mesh of the patches, or None if they are no partition of the profile or do not fit together."""
         try:
-            plane = mesh_patches(patches, self.size_mm * MM, self.least_edges)
+            plane = mesh_patches(patches, self.size_mm * MM, self.least_edges, self.grading)
         except MeshError:
             return None
         return plane if plane.worst() > 0 and abs(plane.area() - solid.area) <= _AREA * solid.area else None
