@@ -33,7 +33,7 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
         if row["status"] != "ok":
             verdict = f"[red]{escape(str(row['status']))}[/red]"
         if estimate.get("uncertain"):
-            verdict += " [yellow](uncertain)[/yellow]"
+            verdict += " [yellow]?[/yellow]"
         drop = _number(row.get("drop_mm"), 2)
         if estimate:
             drop += f" +- {_number(estimate['drop_mm'][1], 2)}"
@@ -64,7 +64,7 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
 
 def _estimate_line(estimate: Mapping[str, Any]) -> str:
     seconds = ", ".join(f"{name.replace('_', ' ')} {value:.1f} s" for name, value in estimate["seconds"].items())
-    uncertain = f"{estimate['uncertain']} of {estimate['objects']} verdicts are uncertain"
+    uncertain = f"{estimate['uncertain']} of {estimate['objects']} verdicts are uncertain (?)"
     return f"error estimate: {uncertain}; simulated for: {seconds}"
 
 

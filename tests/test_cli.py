@@ -38,6 +38,7 @@ RESULT = {
     "fitness": 1 / 3, "margin": -0.3374, "features": {"workspace_mm2": 2078.46}, "objects": ROWS,
     "assumptions": ["mu is 0.6"], "effects": {"friction": "on"}, "timings": {"total": 12.5},
     "mesh": {"elements": {"hex8": 900}}, "versions": {},
+    "accuracy": {"preset": "standard", "applies": False, "sentence": "not measured yet"},
 }
 
 
@@ -45,7 +46,7 @@ class FakeEvaluate:
     """Stands in for `finqd.evaluate.evaluate`: keeps what it is called with, returns RESULT or raises."""
 
     def __init__(self):
-        self.calls, self.error = [], None
+        self.calls, self.error, self.result = [], None, RESULT
 
     def __call__(self, design, *, objects, preset, jobs, record, progress, estimate_error):
         call = {"design": design, "objects": objects, "preset": preset, "jobs": jobs, "record": record}
@@ -57,7 +58,7 @@ class FakeEvaluate:
         return self
 
     def to_dict(self):
-        return RESULT
+        return self.result
 
 
 @pytest.fixture
@@ -83,7 +84,7 @@ def run(capsys):
 def test_help_names_every_command(run):
     code, out, _ = run("--help")
     assert code == 0
-    for command in ("evaluate", "optimise", "export", "schema", "plugins", "doctor", "objects", "designs"):
+    for command in ("evaluate", "optimise", "export", "schema", "plugins", "doctor", "presets", "objects", "designs"):
         assert f"\n  {command} " in out
         assert run(command, "--help")[0] == 0
 
@@ -96,9 +97,52 @@ def test_evaluate_prints_a_row_an_object_with_its_numbers_and_the_reason_of_a_fa
     assert lines["cube"][:3] == ["cube", "no", "30.00"]
     assert "diverged" in out and "pasta: at t = 0.41 s the [residual] did not fall" in out
     assert "fitness 0.333 (1 of 3 held), margin -0.337" in out
+    assert "\naccuracy of the preset standard: not measured yet\n" in out
+    assert "uncertain" not in out and "+-" not in out and not evaluated.calls[0]["estimate_error"]
     for text in ("workspace_mm2 = 2078.46", "mu is 0.6", "friction = on", "elements.hex8 = 900"):
         assert text in out
     assert "sphere: done" in err and "15 lies outside the search range 20 to 30" in err
+
+
+def test_an_error_estimate_is_asked_for_and_shown(run, evaluated):
+    sure = {"drop_mm": [0.1234, 0.05], "uncertain": False, "reason": ""}
+    flips = {"drop_mm": [-30.0, 12.34], "uncertain": True, "reason": "lost, but held with the [coarser] mesh"}
+    failed = {"drop_mm": [None, None], "uncertain": True, "reason": "the simulation itself: diverged"}
+    rows = {name: {**ROWS[name], "estimate": one} for name, one in zip(ROWS, (sure, flips, failed))}
+    whole = {"uncertain": 2, "objects": 3, "seconds": {"base": 12.54, "coarser_mesh": 4.0, "longer_step": 7.0}}
+    evaluated.result = {**RESULT, "objects": rows, "estimate": whole}
+    code, out, _ = run("evaluate", "benchmark", "--estimate-error")
+    assert code == 0 and evaluated.calls[0]["estimate_error"]
+    lines = {line.split()[0]: line.split() for line in out.splitlines() if line.strip()}
+    assert lines["sphere"][1:5] == ["yes", "0.12", "+-", "0.05"]
+    assert next(line for line in out.splitlines() if line.startswith("cube ")).split()[1:6] == [
+        "no", "?", "30.00", "+-", "12.34"]
+    assert "\ncube: uncertain: lost, but held with the [coarser] mesh\n" in out
+    assert "\npasta: at t = 0.41 s the [residual] did not fall\n" in out
+    seconds = "simulated for: base 12.5 s, coarser mesh 4.0 s, longer step 7.0 s"
+    assert f"\nerror estimate: 2 of 3 verdicts are uncertain (?); {seconds}\n" in out
+
+
+def test_set_means_the_plugin_that_the_preset_chooses(run, evaluated):
+    assert run("evaluate", "benchmark", "--preset", "paper", "--set", "mesher.size_mm=3")[0] == 0
+    assert evaluated.calls[0]["design"].spec("mesher") == {"name": "tetrahedral", "size_mm": 3.0, "order": 1}
+
+
+def test_presets_lists_what_each_sets_and_how_far_off_it_is(run, monkeypatch):
+    code, out, _ = run("presets")
+    assert code == 0
+    for name in cli.PRESETS:
+        assert f"{name}: " in out
+    assert "mesher: tetrahedral (size_mm = 2, order = 1), or swept (size_mm = 2)" in out
+    from finqd import accuracy_bands, presets
+
+    study = {"title": "a press", "date": "2026-01-31", "repeat": "finqd accuracy press"}
+    row = {"settings": presets.PRESETS["draft"], "press_force_error_percent": 12.5}
+    document = {"presets": {"draft": row}, "studies": {"press": study, "grasp": {**study, "date": None}}}
+    monkeypatch.setattr(accuracy_bands, "bands", lambda: document)
+    code, out, _ = run("presets")
+    assert code == 0 and "draft: force of a press 12 % off\n" in out and "fine: not measured yet\n" in out
+    assert out.endswith("press (2026-01-31): a press; to repeat it: finqd accuracy press\n")
 
 
 def test_quiet_prints_no_table_and_no_progress(run, evaluated):
@@ -231,6 +275,8 @@ def places(tmp_path):
         "evaluate benchmark --jobs 0",
         "evaluate benchmark --jobs two",
         "evaluate benchmark --preset best",
+        "evaluate benchmark --estimate-error=yes",
+        "evaluate benchmark --preset paper --set mesher.layers=2",
         "evaluate benchmark --set",
         "evaluate benchmark --set hold",
         "evaluate benchmark --set =3",
@@ -267,6 +313,7 @@ def places(tmp_path):
         "schema --geometry no_such",
         "plugins --kind geometri",
         "objects extra",
+        "presets extra",
         "doctor --fix",
     ],
 )

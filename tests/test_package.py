@@ -76,6 +76,7 @@ def test_no_module_of_the_core_imports_a_plugin():
 
 def test_the_folders_are_found_in_a_checkout():
     assert data.objects_folder() == ROOT / "objects" and data.designs_folder() == ROOT / "designs"
+    assert data.studies_folder() == ROOT / "studies"
     assert len(data.bundled_names(data.objects_folder())) == 10
     assert "benchmark" in data.bundled_names(data.designs_folder())
 
@@ -85,7 +86,7 @@ def test_the_wheel_holds_the_package_its_data_and_nothing_else(wheel_environment
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.partition("/")[0] for name in names}
     assert tops == {"finqd", f"finqd-{finqd.__version__}.dist-info"}
-    for folder in ("objects", "designs"):
+    for folder in ("objects", "designs", "studies"):
         carried = {Path(name).name for name in names if name.startswith(f"finqd/bundled/{folder}/")}
         assert {path.name for path in (ROOT / folder).glob("*.json")} <= carried
     assert any(name.endswith("licenses/LICENSE") for name in names)
