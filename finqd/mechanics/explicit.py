@@ -138,7 +138,7 @@ class Motion:
         return rotation_matrix(h * self.spin(b, middle)) @ rotation
 
     def direction(self, h: float, time: float) -> Direction:
-        """Return where everything goes in ``h`` [s] at the velocities of now, under gravity and dead loads alone; drives
+        """Return where everything goes in ``h`` [s] at the velocities of now under gravity and dead loads alone, drives
         to where they are at ``time``.
         """
         system, fall = self.system, 0.5 * h * h

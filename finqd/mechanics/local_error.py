@@ -14,7 +14,7 @@ SHORTER, LONGER = 0.2, 2.0  # a step changes at most by these factors: BDF2 is s
 
 
 def euler_error(system: System, start: State, end: State) -> float:
-    """Return the local error of an implicit Euler step, dt/2 |v1 - v0| [m], the largest of all free bodies and vertices.
+    """Return the local error of an implicit Euler step, dt/2 |v1 - v0| [m], the largest of free bodies and vertices.
 
     The leading term dt^2/2 x'' of the Taylor series (Hairer, Norsett and Wanner I, III.2), with x'' = (v1 - v0)/dt.
     """
@@ -50,8 +50,8 @@ def _largest(system: System, soft: np.ndarray, rigid: np.ndarray) -> float:
 def judge(report: StepReport, error: float, *, tolerance: float | None, order: int, dt: float, shortest: float) -> bool:
     """Tell whether a converged step of ``dt`` [s] stands, and write into ``report`` what follows from its error [m].
 
-    The next step is dt (tolerance / error)^(1 / (order + 1)), with a margin and within a factor of the last. A step that
-    is ``shortest`` [s] already stands whatever its error: contact that begins has no derivative to be resolved.
+    The next step is dt (tolerance / error)^(1 / (order + 1)), with a margin and within a factor of the last. A step
+    that is ``shortest`` [s] already stands whatever its error: contact that begins has no derivative to be resolved.
     """
     report.error = error
     if tolerance is None:

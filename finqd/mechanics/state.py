@@ -89,5 +89,6 @@ class StepReport:
 
     def add_work(self, other: StepReport) -> None:
         """Add what another attempt at the same step cost."""
-        for name in ("iterations", "line_searches", "factorisations", "cg_iterations", "projections", "friction_updates"):
+        counted = ("iterations", "line_searches", "factorisations", "cg_iterations", "projections", "friction_updates")
+        for name in counted:
             setattr(self, name, getattr(self, name) + getattr(other, name))

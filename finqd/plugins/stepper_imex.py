@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Gt, Le, Lt
+from annotated_types import Gt, Lt
 
 from finqd.mechanics.assembly_kernels import add_diagonal, hold
 from finqd.mechanics.explicit import Motion, SubstepOptions, substeps
