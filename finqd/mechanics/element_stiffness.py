@@ -211,6 +211,16 @@ def _level_dilatation(b: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return result
 
 
+def mode_amplitudes(
+    kind: Element, gradients: np.ndarray, modes: np.ndarray, weights: np.ndarray, lame: tuple[float, float]
+) -> np.ndarray:
+    """Return -K_mm^-1 K_mu (n, 3m, 3k): the amplitudes of the modes for nodal displacements; dof = 3 * node + axis."""
+    own, b, material = strain_matrix(modes), strain_matrix(gradients), isotropic(*lame)
+    if kind.name == "wedge6":
+        own, b = _level_dilatation(own, weights), _level_dilatation(b, weights)
+    return -np.linalg.solve(_integral(own, own, material, weights), _integral(own, b, material, weights))
+
+
 def _condensed(b: np.ndarray, modes: np.ndarray, material: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return K_uu - K_um K_mm^-1 K_mu: the modes take the amplitudes that leave them without force."""
     coupling = _integral(modes, b, material, weights)

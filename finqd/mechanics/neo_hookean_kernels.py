@@ -11,14 +11,16 @@ and mu/2 sum_ab S_ab x_a . x_b (hex20's hourglass modes). With f_a = F g_a, c_a 
                  - p/J c_b c_a^T) + sum_g kappa/2 (1 + 1/Jm^2) / V_g d_a d_b^T,    d_a = sum_{q in g} w c_a
 
 (g_a x g_b goes to F (g_a x g_b) = c_a x c_b / J.) The enhanced modes alpha are inner unknowns: the energy of an element
-is its minimum over them, found by Newton's method with a line search from alpha = 0, a pure function of the positions;
-at the minimum the gradient needs no derivative of alpha, and the Hessian is condensed.
+is its minimum over them, found by Newton's method with a line search from what small strain theory gives, a pure
+function of the positions; at the minimum the gradient needs no derivative of alpha, and the Hessian is condensed.
 Sources: Simo, Taylor and Pister, Comput. Methods Appl. Mech. Eng. 51 (1985) 177 (decoupled W, mean dilatation);
 Hartmann and Neff, Int. J. Solids Struct. 40 (2003) 2767 (both terms are polyconvex; the second grows without bound
 as J -> 0); Simo and Armero, Int. J. Numer. Methods Eng. 33 (1992) 1413 (enhanced modes at large strain).
 
-Arrays of a block: nodes (n, k) scene vertex ids; shapes (n, q, 3, k + m): columns g_a, then G_m [1/m]; weights (n, q)
-[m^3]; group (q,): group of each point, 0, 1, ...; hourglass S (n or 0, k, k) [m]; positions (n_vertices, 3) [m].
+Arrays of a block: nodes (n, k) scene vertex ids; shapes (n, k + m, 3 Q): rows g_a, then G_m [1/m], column Q j + q for
+axis j and point q; weights (n, Q) [m^3]; group (Q,): group of each point, 0, 1, ...; start (n, 3 m, 3 k + 1): see
+`_guess`; hourglass S (n or 0, k, k) [m]; positions
+(n_vertices, 3) [m]. F and C of an element: (3, 3 Q), columns as in shapes.
 """
 
 from __future__ import annotations
@@ -28,56 +30,36 @@ import math
 import numpy as np
 from numba import njit
 
+from finqd.mechanics.polar_kernels import closest_rotation
+
 INNER_ITERATIONS = 50  # of Newton's method for the modes
-CONVERGED = 1e-18  # squared Newton decrement [mu V] after which one more step is exact to rounding
+CONVERGED = 1e-12  # squared Newton decrement [mu V] after which one more step is exact to rounding
 SURE = 1e-11  # squared Newton decrement [mu V] below which rounding makes a comparison of energies useless
 
-
-@njit(cache=True)
-def _place(e, nodes, shapes, positions, x, base):
-    """Write the element's nodes about its first one to x (3, k + m), zero for the modes, and their F to base."""
-    k = nodes.shape[1]
-    v0 = nodes[e, 0]
-    x[:] = 0.0
-    for a in range(k):
-        v = nodes[e, a]
-        for i in range(3):
-            x[i, a] = positions[v, i] - positions[v0, i]
-    base[:] = 0.0
-    _deform(e, shapes, x, 0, k, base)
+JACOBIAN, TRACE, SHEAR, PRESSURE, MIXED, OWN, TURN = 0, 1, 2, 3, 4, 5, 6  # rows of an element's ``scalars`` (7, Q)
 
 
 @njit(cache=True)
-def _deform(e, shapes, x, first, last, f):
-    """Add sum x_a (x) g_a over the columns first to last to F (q, 3, 3) of all points."""
-    for q in range(shapes.shape[1]):
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for a in range(first, last):
-                    total += x[i, a] * shapes[e, q, j, a]
-                f[q, i, j] += total
-
-
-@njit(cache=True)
-def _strain_energy(e, weights, group, f, c, scalars, dilated, mu, kappa):
-    """Write C, (J, I, s, -) of all points and (Jm, V) of all groups; return the energy [J], inf if a J <= 0.
+def _strain_energy(weights, group, f, c, scalars, dilated, mu, kappa):
+    """Write C, J, I, s and p of all points and (Jm, V) of all groups; return the energy [J], inf if a J <= 0.
 
     tr F^T F - 3 and J^2 - 1 come from the strain E = (F^T F - 1)/2, so that a small strain's energy is not lost in the
-    rounding of 3 and 1.
+    rounding of 3 and 1. weights: (Q,)
     """
+    count = weights.shape[0]
     dilated[:] = 0.0
     total = 0.0
-    for q in range(f.shape[0]):
-        f00, f01, f02, f10, f11, f12 = f[q, 0, 0], f[q, 0, 1], f[q, 0, 2], f[q, 1, 0], f[q, 1, 1], f[q, 1, 2]
-        f20, f21, f22 = f[q, 2, 0], f[q, 2, 1], f[q, 2, 2]
+    for q in range(count):
+        y, z = q + count, q + 2 * count
+        f00, f01, f02, f10, f11, f12 = f[0, q], f[0, y], f[0, z], f[1, q], f[1, y], f[1, z]
+        f20, f21, f22 = f[2, q], f[2, y], f[2, z]
         c00, c01, c02 = f11 * f22 - f12 * f21, f12 * f20 - f10 * f22, f10 * f21 - f11 * f20
         jacobian = f00 * c00 + f01 * c01 + f02 * c02
         if not jacobian > 0.0:
             return math.inf
-        c[q, 0, 0], c[q, 0, 1], c[q, 0, 2] = c00, c01, c02
-        c[q, 1, 0], c[q, 1, 1], c[q, 1, 2] = f02 * f21 - f01 * f22, f00 * f22 - f02 * f20, f01 * f20 - f00 * f21
-        c[q, 2, 0], c[q, 2, 1], c[q, 2, 2] = f01 * f12 - f02 * f11, f02 * f10 - f00 * f12, f00 * f11 - f01 * f10
+        c[0, q], c[0, y], c[0, z] = c00, c01, c02
+        c[1, q], c[1, y], c[1, z] = f02 * f21 - f01 * f22, f00 * f22 - f02 * f20, f01 * f20 - f00 * f21
+        c[2, q], c[2, y], c[2, z] = f01 * f12 - f02 * f11, f02 * f10 - f00 * f12, f00 * f11 - f01 * f10
         a = f00 * f00 + f10 * f10 + f20 * f20 - 1.0
         b = f01 * f01 + f11 * f11 + f21 * f21 - 1.0
         d = f02 * f02 + f12 * f12 + f22 * f22 - 1.0
@@ -87,98 +69,97 @@ def _strain_energy(e, weights, group, f, c, scalars, dilated, mu, kappa):
         trace = a + b + d
         square = trace + (a * b + b * d + a * d - g * g - h * h - o * o) + (
             a * b * d + 2.0 * g * h * o - a * g * g - b * h * h - d * o * o)
-        log = math.log1p(square) if square > -0.5 else 2.0 * math.log(jacobian)
-        root = math.exp(-log / 3.0)
-        w = weights[e, q]
-        total += 0.5 * mu * w * (3.0 * math.expm1(-log / 3.0) + trace * root)
-        dilated[group[q], 0] += w * math.expm1(0.5 * log)
+        root = 1.0 / np.cbrt(jacobian * jacobian)
+        less = -square / (jacobian * jacobian * (root * root + root + 1.0))  # root - 1: both of root^3 = 1/J^2
+        w = weights[q]
+        total += 0.5 * mu * w * (3.0 * less + trace * root)
+        dilated[group[q], 0] += w * square / (1.0 + jacobian)
         dilated[group[q], 1] += w
-        scalars[q, 0], scalars[q, 1], scalars[q, 2] = jacobian, trace + 3.0, mu * root
+        scalars[JACOBIAN, q], scalars[TRACE, q], scalars[SHEAR, q] = jacobian, trace + 3.0, mu * root
     for n in range(dilated.shape[0]):
         change = dilated[n, 0] / dilated[n, 1]
         total += dilated[n, 1] * 0.25 * kappa * (change * (2.0 + change) - 2.0 * math.log1p(change))
         dilated[n, 0] = 1.0 + change
-    for q in range(f.shape[0]):
+    for q in range(count):
         jm = dilated[group[q], 0]
-        scalars[q, 3] = 0.5 * kappa * (jm - 1.0 / jm) - scalars[q, 2] * scalars[q, 1] / (3.0 * scalars[q, 0])
+        scalars[PRESSURE, q] = 0.5 * kappa * (jm - 1.0 / jm) - (
+            scalars[SHEAR, q] * scalars[TRACE, q] / (3.0 * scalars[JACOBIAN, q]))
     return total
 
 
 @njit(cache=True)
-def _element_gradient(e, shapes, weights, f, c, scalars, first, last, out):
-    """Write the gradient [N] for the columns first to last of x to out (3, last - first)."""
-    out[:] = 0.0
-    for q in range(f.shape[0]):
-        s, p = weights[e, q] * scalars[q, 2], weights[e, q] * scalars[q, 3]
-        for i in range(3):
-            k0 = s * f[q, i, 0] + p * c[q, i, 0]
-            k1 = s * f[q, i, 1] + p * c[q, i, 1]
-            k2 = s * f[q, i, 2] + p * c[q, i, 2]
-            for a in range(first, last):
-                out[i, a - first] += k0 * shapes[e, q, 0, a] + k1 * shapes[e, q, 1, a] + k2 * shapes[e, q, 2, a]
-
-
-@njit(cache=True)
-def _vectors(e, q, shapes, f, c, first, last, fv, cv):
-    """Write f_a and c_a of point q, for the columns first to last, to fv and cv (3, last - first)."""
+def _gradient(weights, shapes, f, c, scalars, stress, out):
+    """Write the gradient [N] for some rows of shapes to out (3, rows); stress (3, 3 Q): scratch."""
+    count = weights.shape[0]
     for i in range(3):
-        f0, f1, f2, c0, c1, c2 = f[q, i, 0], f[q, i, 1], f[q, i, 2], c[q, i, 0], c[q, i, 1], c[q, i, 2]
-        for a in range(first, last):
-            g0, g1, g2 = shapes[e, q, 0, a], shapes[e, q, 1, a], shapes[e, q, 2, a]
-            fv[i, a - first] = f0 * g0 + f1 * g1 + f2 * g2
-            cv[i, a - first] = c0 * g0 + c1 * g1 + c2 * g2
+        for j in range(3):
+            for q in range(count):
+                stress[i, j * count + q] = weights[q] * (
+                    scalars[SHEAR, q] * f[i, j * count + q] + scalars[PRESSURE, q] * c[i, j * count + q])
+    np.dot(stress, shapes.T, out)
 
 
 @njit(cache=True)
-def _element_hessian(e, shapes, weights, group, f, c, scalars, dilated, kappa, first, last, vectors, dots, h):
-    """Write the Hessian [N/m] for the columns first to last of x to h (3n, 3n), row i n + a for axis i and column a.
+def _factors(weights, group, scalars, dilated, kappa):
+    """Write what the Hessian multiplies: rows MIXED, OWN and TURN of scalars."""
+    for q in range(weights.shape[0]):
+        w, jacobian, s = weights[q], scalars[JACOBIAN, q], scalars[SHEAR, q]
+        scalars[MIXED, q] = -2.0 * w * s / (3.0 * jacobian)
+        scalars[OWN, q] = 5.0 * w * s * scalars[TRACE, q] / (18.0 * jacobian * jacobian)
+        scalars[TURN, q] = w * scalars[PRESSURE, q] / jacobian
+        if dilated.shape[0] == weights.shape[0]:  # each point its own group
+            jm = dilated[group[q], 0]
+            scalars[OWN, q] += 0.25 * kappa * (1.0 + 1.0 / (jm * jm)) * w
 
-    Only blocks with j >= i are computed, the others mirrored.
-    vectors: scratch (3 + groups, 3, n): f_a, c_a, the halves h_a of c_a's factor, d_a of each group; dots: (n, n)
+
+@njit(cache=True)
+def _hessian(weights, group, shapes, f, c, scalars, dilated, kappa, vectors, scaled, sums, dots, h):
+    """Write the Hessian [N/m] for n rows of shapes to h (3 n, 3 n), row i n + a for axis i and row a; `_factors` first.
+
+    scratch: vectors (3, 3 n, Q): c_a, half of what multiplies c_a, p/J c_a; scaled (n, 3 Q); sums (3 n, 3 n);
+    dots (n, n)
     """
-    n = last - first
-    h[:] = 0.0
-    dots[:] = 0.0
-    vectors[3:] = 0.0
-    for q in range(f.shape[0]):
-        _vectors(e, q, shapes, f, c, first, last, vectors[0], vectors[1])
-        w, jacobian, s = weights[e, q], scalars[q, 0], scalars[q, 2]
-        turn = w * scalars[q, 3] / jacobian
-        mixed = -2.0 * w * s / (3.0 * jacobian)
-        own = 0.5 * (5.0 * w * s * scalars[q, 1] / (9.0 * jacobian * jacobian) + turn)
-        d = 3 + group[q]
-        for i in range(3):
-            for a in range(n):
-                vectors[2, i, a] = mixed * vectors[0, i, a] + own * vectors[1, i, a]
-                vectors[d, i, a] += w * vectors[1, i, a]
-        for a in range(n):
-            g0, g1, g2 = shapes[e, q, 0, first + a], shapes[e, q, 1, first + a], shapes[e, q, 2, first + a]
-            for b in range(n):
-                dots[a, b] += w * s * (g0 * shapes[e, q, 0, first + b] + g1 * shapes[e, q, 1, first + b]
-                                       + g2 * shapes[e, q, 2, first + b])
-        for i in range(3):
-            for j in range(i, 3):
-                for a in range(n):
-                    u, v, t = vectors[2, i, a], vectors[1, i, a], turn * vectors[1, j, a]
-                    row, column = i * n + a, j * n
-                    for b in range(n):
-                        h[row, column + b] += u * vectors[1, j, b] + v * vectors[2, j, b] - t * vectors[1, i, b]
-    for g in range(dilated.shape[0]):
-        jm = dilated[g, 0]
-        stiff = 0.5 * kappa * (1.0 + 1.0 / (jm * jm)) / dilated[g, 1]
-        for i in range(3):
-            for j in range(i, 3):
-                for a in range(n):
-                    u = stiff * vectors[3 + g, i, a]
-                    for b in range(n):
-                        h[i * n + a, j * n + b] += u * vectors[3 + g, j, b]
+    n, count = shapes.shape[0], weights.shape[0]
+    cv, hv, tv = vectors[0], vectors[1], vectors[2]
     for i in range(3):
         for a in range(n):
-            for b in range(n):
-                h[i * n + a, i * n + b] += dots[a, b]
-            for j in range(i):
+            r = i * n + a
+            for q in range(count):
+                g0, g1, g2 = shapes[a, q], shapes[a, count + q], shapes[a, 2 * count + q]
+                here = c[i, q] * g0 + c[i, count + q] * g1 + c[i, 2 * count + q] * g2
+                cv[r, q] = here
+                hv[r, q] = scalars[OWN, q] * here + scalars[MIXED, q] * (
+                    f[i, q] * g0 + f[i, count + q] * g1 + f[i, 2 * count + q] * g2)
+                tv[r, q] = scalars[TURN, q] * here
+    for a in range(n):
+        for j in range(3):
+            for q in range(count):
+                scaled[a, j * count + q] = weights[q] * scalars[SHEAR, q] * shapes[a, j * count + q]
+    np.dot(scaled, shapes.T, dots)
+    np.dot(tv, cv.T, sums)
+    np.dot(hv, cv.T, h)
+    for i in range(3):
+        for a in range(n):
+            r = i * n + a
+            for b in range(a, n):
+                t = i * n + b
+                h[r, t] = h[t, r] = h[r, t] + h[t, r] + dots[a, b]
+            for j in range(i + 1, 3):
                 for b in range(n):
-                    h[i * n + a, j * n + b] = h[j * n + b, i * n + a]
+                    t = j * n + b
+                    h[r, t] = h[t, r] = h[r, t] + h[t, r] + sums[r, t] - sums[i * n + b, j * n + a]
+    if dilated.shape[0] < count:
+        for g in range(dilated.shape[0]):
+            stiff = 0.5 * kappa * (1.0 + 1.0 / (dilated[g, 0] * dilated[g, 0])) / dilated[g, 1]
+            mean = sums[0]
+            mean[:] = 0.0
+            for q in range(count):
+                if group[q] == g:
+                    for r in range(3 * n):
+                        mean[r] += weights[q] * cv[r, q]
+            for r in range(3 * n):
+                for t in range(3 * n):
+                    h[r, t] += stiff * mean[r] * mean[t]
 
 
 @njit(cache=True)
@@ -202,72 +183,186 @@ def _factor(a, shift):
 
 @njit(cache=True)
 def _step(h, factor, gradient, step):
-    """Write the Newton step -(h + shift 1)^-1 gradient to step (3, m), with a shift where h is not positive definite.
+    """Write the Newton step -(h + shift 1)^-1 gradient to step (n,), with a shift where h is not positive definite.
 
-    Return the squared Newton decrement [J].
+    Only the lower triangle of h is read. Return the squared Newton decrement [J].
     """
-    n, m = h.shape[0], gradient.shape[1]
+    n = h.shape[0]
     trace = 0.0
     for i in range(n):
         trace += abs(h[i, i])
     shift = 0.0
-    factor[:] = h
-    while not _factor(factor, shift):
+    while True:
+        for i in range(n):
+            for j in range(i + 1):
+                factor[i, j] = h[i, j]
+        if _factor(factor, shift):
+            break
         shift = max(10.0 * shift, 1e-4 * trace / n)
-        factor[:] = h
-    y = step.reshape(-1)
     for i in range(n):
-        total = -gradient[i // m, i % m]
+        total = -gradient[i]
         for p in range(i):
-            total -= factor[i, p] * y[p]
-        y[i] = total / factor[i, i]
+            total -= factor[i, p] * step[p]
+        step[i] = total / factor[i, i]
     decrement = 0.0
     for i in range(n - 1, -1, -1):
-        decrement += y[i] * y[i]
+        decrement += step[i] * step[i]
         for p in range(i + 1, n):
-            y[i] -= factor[p, i] * y[p]
-        y[i] /= factor[i, i]
+            step[i] -= factor[p, i] * step[p]
+        step[i] /= factor[i, i]
     return decrement
 
 
 @njit(cache=True)
-def _relax(e, shapes, weights, group, k, mu, kappa, x, base, f, c, scalars, dilated, gradient, vectors, dots, h, factor,
-           step):
-    """Find the modes (the last columns of x, from 0) that minimise the energy; return it [J], with F, C, ... there.
+def _mode_derivatives(weights, group, modes, f, c, scalars, dilated, kappa, gradient, h, vectors, mean):
+    """Write gradient [N] (3 m,) and the lower triangle of the Hessian [N/m] (3 m, 3 m) for the modes, 3 mode + axis.
 
-    inf if a point is inverted at the start, or if Newton's method does not end.
+    `_gradient` and `_hessian` in one, for few rows. scratch: vectors (2, 3 m), mean (groups, 3 m)
     """
-    last = shapes.shape[3]
-    f[:] = base
-    energy = _strain_energy(e, weights, group, f, c, scalars, dilated, mu, kappa)
-    if last == k or energy == math.inf:
-        return energy
-    size = 0.0
-    for q in range(weights.shape[1]):
-        size += mu * weights[e, q]
+    count, m = weights.shape[0], modes.shape[0]
+    own_groups = dilated.shape[0] == count
+    gradient[:] = 0.0
+    h[:] = 0.0
+    mean[:] = 0.0
+    _factors(weights, group, scalars, dilated, kappa)
+    for q in range(count):
+        s, p = weights[q] * scalars[SHEAR, q], weights[q] * scalars[PRESSURE, q]
+        mixed, own, turn = scalars[MIXED, q], scalars[OWN, q], scalars[TURN, q]
+        for a in range(m):
+            g0, g1, g2 = modes[a, q], modes[a, count + q], modes[a, 2 * count + q]
+            for i in range(3):
+                fa = f[i, q] * g0 + f[i, count + q] * g1 + f[i, 2 * count + q] * g2
+                ca = c[i, q] * g0 + c[i, count + q] * g1 + c[i, 2 * count + q] * g2
+                gradient[3 * a + i] += s * fa + p * ca
+                vectors[0, 3 * a + i] = ca
+                vectors[1, 3 * a + i] = mixed * fa + own * ca
+            for b in range(a + 1):
+                dot = s * (g0 * modes[b, q] + g1 * modes[b, count + q] + g2 * modes[b, 2 * count + q])
+                for i in range(3):
+                    h[3 * a + i, 3 * b + i] += dot
+        for r in range(3 * m):
+            u, v = vectors[1, r], vectors[0, r]
+            for t in range(r + 1):
+                h[r, t] += u * vectors[0, t] + v * vectors[1, t]
+        if not own_groups:
+            for r in range(3 * m):
+                mean[group[q], r] += weights[q] * vectors[0, r]
+        for a in range(3, 3 * m, 3):
+            for b in range(0, a, 3):
+                x = turn * (vectors[0, a + 1] * vectors[0, b + 2] - vectors[0, a + 2] * vectors[0, b + 1])
+                y = turn * (vectors[0, a + 2] * vectors[0, b] - vectors[0, a] * vectors[0, b + 2])
+                z = turn * (vectors[0, a] * vectors[0, b + 1] - vectors[0, a + 1] * vectors[0, b])
+                h[a, b + 1] += z
+                h[a + 1, b] -= z
+                h[a + 1, b + 2] += x
+                h[a + 2, b + 1] -= x
+                h[a + 2, b] += y
+                h[a, b + 2] -= y
+    if not own_groups:
+        for g in range(dilated.shape[0]):
+            stiff = 0.5 * kappa * (1.0 + 1.0 / (dilated[g, 0] * dilated[g, 0])) / dilated[g, 1]
+            for r in range(3 * m):
+                for t in range(r + 1):
+                    h[r, t] += stiff * mean[g, r] * mean[g, t]
+
+
+@njit(cache=True)
+def _guess(x, base, start, alpha):
+    """Write to alpha (3, m) the modes that the nodes' displacement in the element's own frame excites at small strain.
+
+    The frame is that of the rotation closest to the mean of F over the points (base, without modes); x: (3, k) [m]
+    start: (3 m, 3 k + 1), in its last column the modes that the rest positions would give
+    """
+    count, k, m = base.shape[1] // 3, x.shape[1], alpha.shape[1]
+    mean, r = np.zeros((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for q in range(count):
+                mean[i, j] += base[i, j * count + q] / count
+    closest_rotation(mean, r)
+    local = np.zeros((3, m))
+    for i in range(3):
+        for a in range(m):
+            local[i, a] = -start[i * m + a, 3 * k]
+    for j in range(3):
+        for b in range(k):
+            y = r[0, j] * x[0, b] + r[1, j] * x[1, b] + r[2, j] * x[2, b]
+            for i in range(3):
+                for a in range(m):
+                    local[i, a] += start[i * m + a, j * k + b] * y
+    for i in range(3):
+        for a in range(m):
+            alpha[i, a] = r[i, 0] * local[0, a] + r[i, 1] * local[1, a] + r[i, 2] * local[2, a]
+
+
+@njit(cache=True)
+def _bend(base, alpha, modes, f):
+    """Write F = base + sum alpha_m (x) G_m of all points."""
+    for i in range(3):
+        for n in range(base.shape[1]):
+            f[i, n] = base[i, n]
+        for a in range(alpha.shape[1]):
+            for n in range(base.shape[1]):
+                f[i, n] += alpha[i, a] * modes[a, n]
+
+
+@njit(cache=True)
+def _relax(weights, group, modes, start, mu, kappa, x, base, f, c, scalars, dilated, alpha, known, work):
+    """Find the modes alpha (3, m) that minimise the energy; return it [J], with F, C, ... there.
+
+    known: alpha is what this function found for the same positions. inf if a point is inverted at the start, or if
+    Newton's method does not end.
+    """
+    if known or modes.shape[0] == 0:
+        _bend(base, alpha, modes, f)
+        return _strain_energy(weights, group, f, c, scalars, dilated, mu, kappa)
+    trial, step, gradient, vectors, mean, h, factor = work
+    _guess(x, base, start, alpha)
+    _bend(base, alpha, modes, f)
+    energy = _strain_energy(weights, group, f, c, scalars, dilated, mu, kappa)
+    if energy == math.inf:
+        alpha[:] = 0.0
+        f[:] = base
+        energy = _strain_energy(weights, group, f, c, scalars, dilated, mu, kappa)
+        if energy == math.inf:
+            return energy
+    size = mu * weights.sum()
     for _ in range(INNER_ITERATIONS):
-        _element_gradient(e, shapes, weights, f, c, scalars, k, last, gradient)
-        _element_hessian(e, shapes, weights, group, f, c, scalars, dilated, kappa, k, last, vectors, dots, h)
+        _mode_derivatives(weights, group, modes, f, c, scalars, dilated, kappa, gradient, h, vectors, mean)
         decrement = _step(h, factor, gradient, step)
         share, before = 1.0, energy
         while True:
             for i in range(3):
-                for a in range(k, last):
-                    x[i, a] += share * step[i, a - k]
-            f[:] = base
-            _deform(e, shapes, x, k, last, f)
-            energy = _strain_energy(e, weights, group, f, c, scalars, dilated, mu, kappa)
+                for a in range(alpha.shape[1]):
+                    trial[i, a] = alpha[i, a] + share * step[3 * a + i]
+            _bend(base, trial, modes, f)
+            energy = _strain_energy(weights, group, f, c, scalars, dilated, mu, kappa)
             if energy <= before - 1e-4 * share * decrement or (decrement <= SURE * size and energy < math.inf):
                 break
-            for i in range(3):
-                for a in range(k, last):
-                    x[i, a] -= share * step[i, a - k]
             share *= 0.5
             if share < 1e-9:
                 return math.inf
+        alpha[:] = trial
         if decrement <= CONVERGED * size:
             return energy
     return math.inf
+
+
+@njit(cache=True)
+def _work(m, groups):
+    """Return the scratch arrays of `_relax` for m modes."""
+    return (np.empty((3, m)), np.empty(3 * m), np.empty(3 * m), np.empty((2, 3 * m)), np.empty((groups, 3 * m)),
+            np.empty((3 * m, 3 * m)), np.empty((3 * m, 3 * m)))
+
+
+@njit(cache=True)
+def _place(e, nodes, positions, x):
+    """Write the element's nodes about its first one to x (3, k)."""
+    v0 = nodes[e, 0]
+    for a in range(nodes.shape[1]):
+        v = nodes[e, a]
+        for i in range(3):
+            x[i, a] = positions[v, i] - positions[v0, i]
 
 
 @njit(cache=True)
@@ -307,8 +402,11 @@ def _condense(h, k, m, lower, rows, out):
     for t in range(3 * m):
         for a in range(3 * k):
             w = rows[t, a]
-            for b in range(3 * k):
+            for b in range(a, 3 * k):
                 out[a, b] -= w * rows[t, b]
+    for a in range(3 * k):
+        for b in range(a):
+            out[a, b] = out[b, a]
 
 
 @njit(cache=True)
@@ -347,42 +445,60 @@ def _hourglass(e, hourglass, mu, x, gradient):
 
 
 @njit(cache=True)
-def _walk(nodes, shapes, weights, group, hourglass, mu, kappa, positions, gradient, slots, blocks, task, projected):
-    """Do for each element: task 0 its energy; 1 the gradient too; 2 only its Hessian. Return the energy [J]."""
-    k, last = nodes.shape[1], shapes.shape[3]
-    m, points, groups = last - k, shapes.shape[1], 0
-    for q in range(points):
-        groups = max(groups, group[q] + 1)
-    x, base, f, c = np.empty((3, last)), np.empty((points, 3, 3)), np.empty((points, 3, 3)), np.empty((points, 3, 3))
-    scalars, dilated = np.empty((points, 4)), np.empty((groups, 2))
-    mode_gradient, mode_vectors, mode_dots = np.empty((3, m)), np.empty((3 + groups, 3, m)), np.empty((m, m))
-    mode_h, mode_factor, mode_step = np.empty((3 * m, 3 * m)), np.empty((3 * m, 3 * m)), np.empty((3, m))
-    own = np.empty((3, k))
-    size = last if task == 2 else 0
-    vectors, dots, h = np.empty((3 + groups, 3, size)), np.empty((size, size)), np.empty((3 * size, 3 * size))
-    size = 3 * k if task == 2 else 0
-    rows, out, factor = np.empty((3 * m, size)), np.empty((size, size)), np.empty((size, size))
+def add_gradient(nodes, shapes, weights, group, start, hourglass, mu, kappa, positions, modes, known, gradient):
+    """Return the energy [J] of a block and add its gradient [N] to gradient (n_vertices, 3), unless that is empty.
+
+    The energy is inf, and the gradient of no use, if a point of an element is inverted.
+    modes: alpha of all elements (n, 3, m) [m]: read if they are known for these positions, else written
+    """
+    k, points, groups = nodes.shape[1], weights.shape[1], group.max() + 1
+    x, own, work = np.empty((3, k)), np.empty((3, k)), _work(shapes.shape[1] - k, groups)
+    base, f, c, stress = (np.empty((3, 3 * points)), np.empty((3, 3 * points)), np.empty((3, 3 * points)),
+                          np.empty((3, 3 * points)))
+    scalars, dilated = np.empty((7, points)), np.empty((groups, 2))
     total = 0.0
     for e in range(nodes.shape[0]):
-        _place(e, nodes, shapes, positions, x, base)
-        energy = _relax(e, shapes, weights, group, k, mu, kappa, x, base, f, c, scalars, dilated, mode_gradient,
-                        mode_vectors, mode_dots, mode_h, mode_factor, mode_step)
+        _place(e, nodes, positions, x)
+        np.dot(x, shapes[e, :k], base)
+        total += _relax(weights[e], group, shapes[e, k:], start[e], mu, kappa, x, base, f, c, scalars, dilated,
+                        modes[e], known, work)
+        if total == math.inf:
+            return total
+        if gradient.shape[0] > 0:
+            _gradient(weights[e], shapes[e, :k], f, c, scalars, stress, own)
+        total += _hourglass(e, hourglass, mu, x, own)
+        if gradient.shape[0] > 0:
+            for a in range(k):
+                for i in range(3):
+                    gradient[nodes[e, a], i] += own[i, a]
+    return total
+
+
+@njit(cache=True)
+def add_hessian(nodes, shapes, weights, group, start, hourglass, mu, kappa, positions, modes, known, slots, blocks,
+                projected):
+    """Add the Hessian [N/m] of a block to blocks (n_blocks, 3, 3); slots (n, k, k). Inverted elements add nothing.
+
+    modes, known: as in `add_gradient`; projected: negative eigenvalues of each element's condensed matrix become zero
+    """
+    k, last, points, groups = nodes.shape[1], shapes.shape[1], weights.shape[1], group.max() + 1
+    m = last - k
+    x, work = np.empty((3, k)), _work(m, groups)
+    base, f, c = np.empty((3, 3 * points)), np.empty((3, 3 * points)), np.empty((3, 3 * points))
+    scalars, dilated = np.empty((7, points)), np.empty((groups, 2))
+    vectors, scaled, dots = np.empty((3, 3 * last, points)), np.empty((last, 3 * points)), np.empty((last, last))
+    sums, h, rows = np.empty((3 * last, 3 * last)), np.empty((3 * last, 3 * last)), np.empty((3 * m, 3 * k))
+    lower, out, factor = np.empty((3 * m, 3 * m)), np.empty((3 * k, 3 * k)), np.empty((3 * k, 3 * k))
+    for e in range(nodes.shape[0]):
+        _place(e, nodes, positions, x)
+        np.dot(x, shapes[e, :k], base)
+        energy = _relax(weights[e], group, shapes[e, k:], start[e], mu, kappa, x, base, f, c, scalars, dilated,
+                        modes[e], known, work)
         if energy == math.inf:
-            if task < 2:
-                return energy
             continue
-        if task < 2:
-            if task == 1:
-                _element_gradient(e, shapes, weights, f, c, scalars, 0, k, own)
-            energy += _hourglass(e, hourglass, mu, x, own)
-            if task == 1:
-                for a in range(k):
-                    for i in range(3):
-                        gradient[nodes[e, a], i] += own[i, a]
-            total += energy
-            continue
-        _element_hessian(e, shapes, weights, group, f, c, scalars, dilated, kappa, 0, last, vectors, dots, h)
-        _condense(h, k, m, mode_factor, rows, out)
+        _factors(weights[e], group, scalars, dilated, kappa)
+        _hessian(weights[e], group, shapes[e], f, c, scalars, dilated, kappa, vectors, scaled, sums, dots, h)
+        _condense(h, k, m, lower, rows, out)
         if hourglass.shape[0] > 0:
             for i in range(3):
                 for a in range(k):
@@ -396,24 +512,3 @@ def _walk(nodes, shapes, weights, group, hourglass, mu, kappa, positions, gradie
                 for i in range(3):
                     for j in range(3):
                         blocks[block, i, j] += out[i * k + a, j * k + b]
-    return total
-
-
-@njit(cache=True)
-def energy(nodes, shapes, weights, group, hourglass, mu, kappa, positions):
-    """Return the energy [J] of a block; inf if a point of an element is inverted."""
-    return _walk(nodes, shapes, weights, group, hourglass, mu, kappa, positions, np.empty((0, 3)),
-                 np.empty((0, 0, 0), np.int32), np.empty((0, 3, 3)), 0, False)
-
-
-@njit(cache=True)
-def add_gradient(nodes, shapes, weights, group, hourglass, mu, kappa, positions, gradient):
-    """Add the gradient [N] to gradient (n_vertices, 3) and return the energy [J] of a block."""
-    return _walk(nodes, shapes, weights, group, hourglass, mu, kappa, positions, gradient,
-                 np.empty((0, 0, 0), np.int32), np.empty((0, 3, 3)), 1, False)
-
-
-@njit(cache=True)
-def add_hessian(nodes, shapes, weights, group, hourglass, mu, kappa, positions, slots, blocks, projected):
-    """Add the Hessian [N/m] of a block to blocks (n_blocks, 3, 3); slots (n, k, k). Inverted elements add nothing."""
-    _walk(nodes, shapes, weights, group, hourglass, mu, kappa, positions, np.empty((0, 3)), slots, blocks, 2, projected)
