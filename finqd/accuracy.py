@@ -77,6 +77,10 @@ class Study:
     rows: list[Row] = field(default_factory=list)
     on_row: Callable[[Row], None] | None = None
     on_progress: Callable[[str, float], None] | None = None
+    runner: Callable[..., list[Any]] = run_tasks
+    designs: dict[str, Design] = field(default_factory=dict)  # what each rung computes
+    keys: dict[str, str] = field(default_factory=dict)
+    costs: dict[str, float] = field(default_factory=dict)  # expected seconds on an ordinary core
 
     # -- running --------------------------------------------------------------------------------------------------
 
@@ -109,7 +113,7 @@ class Study:
                 self.on_progress(rungs[index].name, share)
 
         # meshing has a limit of its own; the process is killed only if neither limit was kept
-        run_tasks(
+        self.runner(
             measure_rung, tasks, jobs=self.jobs, time_limit_s=1.2 * limit + 120.0, on_result=on_result,
             on_progress=on_progress,
         )
@@ -141,12 +145,16 @@ class Study:
 
     def applied(self, rung: Rung) -> Design:
         """Return the design that a rung computes."""
-        return rung.applied(self.design.with_overrides(self.case.overrides))
+        if rung.name not in self.designs:
+            self.designs[rung.name] = rung.applied(self.design.with_overrides(self.case.overrides))
+        return self.designs[rung.name]
 
     def key(self, rung: Rung) -> str:
         """Return a hash of all that a rung's value depends on, versions included."""
-        parts = [self.case.name, self.applied(rung).digest(), fingerprint(self.options), self.versions]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
+        if rung.name not in self.keys:
+            parts = [self.case.name, self.applied(rung).digest(), fingerprint(self.options), self.versions]
+            self.keys[rung.name] = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
+        return self.keys[rung.name]
 
     @property
     def physics(self) -> str:
@@ -225,11 +233,10 @@ class Study:
     def expected(self, rung: Rung) -> float:
         """Return about how long a rung takes [s], by what the rungs so far took here."""
         ratios = sorted(
-            row["seconds"] / expected_seconds(self.case, self.applied(known))
+            row["seconds"] / self.costs[known.name]
             for known in self.rungs if (row := self.row_of(known)) and row["status"] == "ok" and row["seconds"] > 0.0
         )
-        scale = ratios[len(ratios) // 2] if ratios else 1.0
-        return scale * expected_seconds(self.case, self.applied(rung))
+        return (ratios[len(ratios) // 2] if ratios else 1.0) * self.costs[rung.name]
 
     def set_reference(self, wanted: str | Reference) -> None:
         """Take the reference that ships with finqd ("auto", if there is one), or make it ("compute")."""
@@ -251,12 +258,12 @@ def open_study(
 
     Raises ``InputError`` for an unknown knob or a log that is none.
     """
-    ladder = build_ladder(design, knobs=knobs, frictionless=case.name == "press")
+    ladder = build_ladder(design.with_overrides(case.overrides), knobs=knobs, frictionless=case.name == "press")
     study = Study(
         case=case, design=design, options=options, out=out, rungs=ladder.rungs, omitted={}, limit=limit, jobs=jobs,
-        full=full, rows=read_rows(out / LOG),
+        full=full, rows=read_rows(out / LOG), designs=dict(ladder.designs),
     )
-    costs = {rung.name: expected_seconds(case, study.applied(rung)) for rung in ladder.rungs}
+    study.costs = costs = {rung.name: expected_seconds(case, study.applied(rung)) for rung in ladder.rungs}
     most = max(DEAR_S, DEAR_TIMES * costs[DEFAULT])
     dear = {
         name: f"expected to take about {cost:.0f} s; --full runs it"

@@ -59,9 +59,10 @@ class Rung:
 
 @dataclass(frozen=True, kw_only=True)
 class Ladder:
-    """Rungs that can be run, and name -> reason of those that cannot."""
+    """Rungs that can be run, name -> what each computes, and name -> reason of those that cannot be run."""
 
     rungs: tuple[Rung, ...]
+    designs: Mapping[str, Design]
     missing: Mapping[str, str]
 
 
@@ -85,25 +86,25 @@ def build_ladder(design: Design, *, knobs: Iterable[str] = (), frictionless: boo
     for knob in sorted(chosen - set(KNOBS)):
         raise InputError(f"there is no knob {knob!r}; known: {', '.join(KNOBS)}", "--knob")
     base = Rung(name=DEFAULT, knob="preset", series="preset", bare=True)
-    rungs: list[Rung] = [base]
+    rungs, designs = [base], {base.name: base.applied(design)}
     missing: dict[str, str] = {}
     for rung in _all_rungs():
         if rung.knob not in chosen or rung.name == base.name or (frictionless and "friction" in rung.name):
             continue
         try:
-            rung.applied(design)
+            designs[rung.name] = rung.applied(design)
             _require_backend(rung)
         except InputError as error:
             missing[rung.name] = error.message
         else:
             rungs.append(rung)
-    return Ladder(rungs=tuple(rungs), missing=missing)
+    return Ladder(rungs=tuple(rungs), designs=designs, missing=missing)
 
 
 def reference_rungs(case: str, *, full: bool) -> tuple[Rung, Rung]:
     """Return the finest rung of two element families that share nothing but the physics."""
     if case == "press":
-        sizes, step = ((1.0, 2.0), 2.5) if full else ((1.5, 3.0), 5.0)
+        sizes, step = ((1.0, 2.0), 5.0) if full else ((1.5, 3.0), 5.0)
     else:
         sizes, step = ((1.5, 3.0), 2.5) if full else ((2.0, 4.0), 5.0)
     return (

@@ -75,11 +75,12 @@ def _mark_presets(axes: Axes, presets: Mapping[str, Row], lowest: float) -> None
     for name, row in sorted(presets.items(), key=lambda item: item[1]["seconds"]):
         point = (row["seconds"], max(abs(row["error_percent"]), lowest))
         text = "the paper's setting" if name == "paper" else name
+        told = f"{text}\n{abs(row['error_percent']):.2g} %, {row['seconds']:.2g} s"
         axes.plot(*point, marker="*", markersize=17, color=PRESET, markeredgecolor="white", linestyle="", zorder=9)
         axes.annotate(
-            f"{text}\n{abs(row['error_percent']):.2g} %, {row['seconds']:.2g} s", point, xytext=(0, 16 if above else -16),
-            textcoords="offset points", ha="center", va="bottom" if above else "top", fontsize=9.5, fontweight="bold",
-            color=PRESET, zorder=10, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0},
+            told, point, xytext=(0, 16 if above else -16), textcoords="offset points", ha="center",
+            va="bottom" if above else "top", fontsize=9.5, fontweight="bold", color=PRESET, zorder=10,
+            bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0},
         )
         above = not above
 

@@ -19,10 +19,16 @@ COLUMNS = (
     "rung", "knob", "series", "status", "error_percent", "change_percent", "seconds", "wall_seconds", "dofs", "steps",
     "newton_iterations", "max_penetration_mm", "on_front",
 )
-STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;background:#fff;max-width:1150px;margin:2em auto;padding:0 1em}
-table{border-collapse:collapse;margin:.6em 0 1.4em;font-size:13.5px}th,td{padding:2px 9px;text-align:left;
+STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;background:#fff;max-width:1150px;margin:2em auto;
+padding:0 1em}table{border-collapse:collapse;margin:.6em 0 1.4em;font-size:13.5px}th,td{padding:2px 9px;text-align:left;
 border-bottom:1px solid #ddd;vertical-align:top}td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}
 tr.front td{background:#eef5ee}tr.bad td{color:#a11}code{font-size:12.5px}img{max-width:100%}.wide{overflow-x:auto}"""
+
+NOTE = (
+    "Errors are signed: positive is too much. A single number can be right by luck, when two errors cancel: look at "
+    "the other quantities before you trust a cheap rung. On the curves of all knobs but mesh size and element the "
+    "mesh of <i>standard</i> is a floor; <i>change</i> is what the knob alone changes against <i>standard</i>."
+)
 
 
 def write_report(study: Study) -> list[Path]:
@@ -102,11 +108,9 @@ def page(study: Study, *, picture: bytes) -> str:
     parts = [
         f"<p>{escape(_headline(study))}</p>",
         f'<p><img alt="error against seconds" src="data:image/png;base64,{image}"></p>',
-        "<p>Errors are signed: positive is too much. A single number can be right by luck, when two errors cancel: look "
-        "at the other quantities before you trust a cheap rung. On the curves of all knobs but mesh size and element "
-        "the mesh of <i>standard</i> is a floor; <i>change</i> is what the knob alone changes against "
-        "<i>standard</i>.</p>",
-        "<h2>The Pareto front</h2>", _table(study, best, chosen), "<h2>The presets</h2>", _table(study, presets, chosen),
+        f"<p>{NOTE}</p>",
+        "<h2>The Pareto front</h2>", _table(study, best, chosen),
+        "<h2>The presets</h2>", _table(study, presets, chosen),
     ]
     for knob, meaning in KNOBS.items():
         turned = [row for row in rows if row["knob"] == knob != "preset"]

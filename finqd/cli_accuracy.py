@@ -21,7 +21,7 @@ _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 @click.command()
 @click.argument("case", type=click.Choice(("press", "closing", "grasp")), default="press")
-@click.option("--design", default="benchmark", show_default=True, metavar="DESIGN", help="A JSON file, or a known name.")
+@click.option("--design", default="benchmark", show_default=True, metavar="DESIGN", help="A file, or a known name.")
 @click.option("--finger", type=int, metavar="I", help="Which finger is pressed, counted from 0 as in the file.")
 @click.option("--object", "grasped", metavar="NAME", help="What is grasped, by name or JSON file.  [default: sphere]")
 @click.option("--knob", "knobs", multiple=True, metavar="NAME", help="Only this knob; may be repeated.  [default: all]")
@@ -57,11 +57,9 @@ def accuracy(
     from finqd.accuracy_cases import CASES, case_options
 
     options = case_options(CASES[case], finger=finger, grasped=grasped, design=chosen)
-    folder = usable_folder(out or Path(f"accuracy-{case}"), "--out")
-    assert folder is not None
-    study = open_study(
-        chosen, CASES[case], options, folder, knobs=[name.strip() for name in knobs], full=full, limit=most, jobs=jobs
-    )
+    folder = out or Path(f"accuracy-{case}")
+    study = open_study(chosen, CASES[case], options, folder, knobs=knobs, full=full, limit=most, jobs=jobs)
+    usable_folder(folder, "--out")
     with shown_progress() as progress:
         study.on_progress, study.on_row = progress, _say_row
         return _answer(study, reference, percent, seconds)
@@ -171,9 +169,10 @@ def _print_answer(study: Study, question: str, row: Row | None) -> None:
     if row is None:
         usable = [r for r in study.table() if r["status"] == "ok" and r["resolved_percent"] is not None]
         nearest: Any = min(usable, key=lambda r: r["resolved_percent"], default=None)
-        least = "" if nearest is None else (
-            f"; the most accurate is {nearest['rung']}: {nearest['resolved_percent']:.3g} % in {nearest['seconds']:.3g} s"
-        )
+        least = ""
+        if nearest is not None:
+            cost = f"{nearest['resolved_percent']:.3g} % in {nearest['seconds']:.3g} s"
+            least = f"; the most accurate is {nearest['rung']}: {cost}"
         hint = "" if study.full else " (--full has more)"
         click.echo(f"{question}: no rung of this ladder does{hint}{least}")
         return

@@ -30,8 +30,12 @@ _TYPES = {
 }
 
 
+@lru_cache(maxsize=512)
 def option_types(owner: type) -> dict[str, Any]:
-    """Return option name -> annotated type, of the fields that the constructor of the dataclass ``owner`` takes."""
+    """Return option name -> annotated type, of the fields that the constructor of the dataclass ``owner`` takes.
+
+    Kept, since evaluating the annotations takes milliseconds: not to be written to.
+    """
     hints = get_type_hints(owner, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(owner) if field.init}
 

@@ -73,15 +73,15 @@ def load(kind: str, name: str, *, where: str = "") -> Any:
         owners = " and ".join(sorted(f"{_distribution(ep)} ({ep.value})" for ep in matches))
         raise PluginError(f"the {kind} plugin {name!r} is registered {len(matches)} times, by {owners}", where)
     (entry_point,) = matches
-    label = f"the {kind} plugin {name!r} of the distribution {_distribution(entry_point)!r}"
     try:
         plugin = entry_point.load()
     except FinqdError:
         raise
     except Exception as error:  # a plugin's module may raise anything at all while it is imported
-        raise PluginError(f"{label} does not import ({type(error).__name__}: {_line(error)})", where) from error
+        text = f"{_label(kind, entry_point)} does not import ({type(error).__name__}: {_line(error)})"
+        raise PluginError(text, where) from error
     if not (isinstance(plugin, type) and dataclasses.is_dataclass(plugin)):
-        raise PluginError(f"{label} is not a dataclass: {entry_point.value}", where)
+        raise PluginError(f"{_label(kind, entry_point)} is not a dataclass: {entry_point.value}", where)
     return plugin
 
 
@@ -139,6 +139,11 @@ def _known(kind: str, where: str = "") -> str:
     if kind not in KINDS:
         raise PluginError(f"there is no plugin kind {kind!r}; known: {', '.join(KINDS)}", where)
     return kind
+
+
+def _label(kind: str, entry_point: EntryPoint) -> str:
+    """Return who is to blame; to name the distribution takes milliseconds, so only where something is wrong."""
+    return f"the {kind} plugin {entry_point.name!r} of the distribution {_distribution(entry_point)!r}"
 
 
 def _listed(kind: str) -> str:
