@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -11,6 +11,7 @@ from annotated_types import Ge, Le
 from finqd.errors import MeshError
 from finqd.mesh import Mesh
 from finqd.mesh_sets import with_finger_sets
+from finqd.mesh_shapes import quadratic
 from finqd.plugins.swept_patches import PlaneMesh, corner_sines, mesh_patches
 from finqd.solid import Patch, Prism, Solid
 from finqd.units import MM
@@ -29,12 +30,14 @@ class Swept:
     thickness / (1.25 size), at least 2; ``least_edges``: elements through a wall at least; ``grading``: above 1, edges
     shrink towards the notches between walls and ribs, with that exponent (patches only). A profile that comes in
     patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by interpolation, without
-    wedges; any other by gmsh.
+    wedges; any other by gmsh. ``order``: 2 gives quadratic hexahedra (hex20, straight edges, a node in the middle of
+    each); there is no quadratic wedge, so that a profile that leaves triangles is refused then.
     """
 
     size_mm: Annotated[float, Ge(0.2), Le(50)] = 4.0
     layers: Annotated[int, Ge(1), Le(200)] | None = None
     least_edges: Annotated[int, Ge(1), Le(10)] = 1
+    order: Literal[1, 2] = 1
     grading: Annotated[float, Ge(1), Le(4)] = 1.0
 
     def mesh(self, solid: Solid) -> Mesh:
@@ -45,7 +48,13 @@ class Swept:
         worst = plane.worst()
         if worst <= 0:
             raise MeshError(f"the profile's best mesh has a turned element (sine of its corner {worst:.2g})")
-        return with_finger_sets(self._sweep(plane, solid.thickness), solid.contact_line)
+        if self.order == 2 and len(plane.triangles):
+            raise MeshError(
+                f"the profile's mesh has {len(plane.triangles)} triangles, and there are no quadratic wedges: use order "
+                "1, another size_mm, or the mesher 'tetrahedral' with order 2"
+            )
+        mesh = self._sweep(plane, solid.thickness)
+        return with_finger_sets(quadratic(mesh) if self.order == 2 else mesh, solid.contact_line)
 
     def _plane(self, solid: Prism) -> PlaneMesh:
         patches = solid.patches or _single_patch(solid)
