@@ -18,6 +18,7 @@ import click
 
 from finqd import __version__
 from finqd.cli_accuracy import accuracy
+from finqd.cli_verify import verify
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, InputError
 
@@ -206,6 +207,7 @@ def doctor() -> int:
 
 
 finqd.add_command(accuracy)
+finqd.add_command(verify)
 
 
 def _read_design(text: str, settings: Sequence[str] = (), preset: str | None = None) -> Any:

@@ -26,6 +26,7 @@ class Case:
     name: what is typed to run it; several cases may share one. quantity, unit: what ``compute`` returns
     reference, source: what it should be and who says so
     band: largest error, relative to the reference, or in ``unit`` if ``absolute``
+    compute: returns the value, or value and a remark
     """
 
     name: str
@@ -35,12 +36,12 @@ class Case:
     source: str
     band: float
     absolute: bool
-    compute: Callable[[], float] = field(compare=False)
+    compute: Callable[[], float | tuple[float, str]] = field(compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What became of a case; ``error`` as ``Case.band`` has it, ``reason`` of a value that could not be computed."""
+    """What became of a case; ``error`` as ``Case.band`` has it; ``note``: a remark, or why there is no value."""
 
     case: str
     quantity: str
@@ -53,7 +54,7 @@ class Row:
     absolute: bool
     passed: bool
     seconds: float
-    reason: str = ""
+    note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row as JSON holds it: what is no number is null."""
@@ -65,19 +66,21 @@ class Failed(RuntimeError):
 
 
 def measure(case: Case) -> Row:
-    """Run a case. What fails is a row that has not passed, with a reason."""
+    """Run a case. What fails is a row that has not passed, with a note that says why."""
     begun = time.perf_counter()
-    value, reason = math.nan, ""
+    value, note = math.nan, ""
     try:
-        value = float(case.compute())
+        found = case.compute()
+        value, note = found if isinstance(found, tuple) else (found, "")
+        value = float(value)
     except (Failed, FinqdError, ArithmeticError) as error:
-        reason = str(error)
+        note = str(error)
     off = value - case.reference
     error = off if case.absolute else off / abs(case.reference)
     return Row(
         case=case.name, quantity=case.quantity, unit=case.unit, reference=case.reference, source=case.source,
         value=value, error=error, band=case.band, absolute=case.absolute,
-        passed=math.isfinite(error) and abs(error) <= case.band, seconds=time.perf_counter() - begun, reason=reason,
+        passed=math.isfinite(error) and abs(error) <= case.band, seconds=time.perf_counter() - begun, note=note,
     )
 
 

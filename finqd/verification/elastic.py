@@ -5,7 +5,6 @@ All go through the energy, gradient and Hessian that a grasp is made of (`finqd.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -22,8 +21,8 @@ from finqd.mechanics.rotation_kernels import rotation_matrix
 from finqd.mesh import Mesh
 from finqd.mesh_shapes import box_mesh
 from finqd.units import MM, MPA
-from finqd.verification.cases import Case, Failed, observed_order
-from finqd.verification.meshes import COOK_THICKNESS, cook_mesh
+from finqd.verification.cases import Failed
+from finqd.verification.meshes import cook_mesh
 
 ELEMENTS = ("hex8", "hex20", "wedge6", "tet4", "tet10")
 QUADRATIC = ("hex20", "tet10")

@@ -10,9 +10,11 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from finqd.objects import GraspObject, load_object
 from finqd.scene import Motion, Scene, Shift, eased
 from finqd.simulate import simulate
 from finqd.units import MM, MS
+from finqd.verification.cases import Case, Failed
 
 if TYPE_CHECKING:
     from finqd.design import Design
@@ -176,3 +179,41 @@ def _failed(status: str, reason: str, *, dofs: int = 0) -> Press:
         status=status, reason=reason, force=math.nan, depths=np.zeros(0), forces=np.zeros(0), max_penetration=0.0,
         dofs=dofs, steps=0, newton_iterations=0, seconds=0.0, energy=math.nan,
     )
+
+
+# -- cases -------------------------------------------------------------------------------------------------------------
+
+#: force of the benchmark finger's press [N] that a study with two element families converged to; None: not yet known
+REFERENCE: float | None = None
+FAMILIES = ({"mesher.size_mm": 2}, {"mesher": {"name": "tetrahedral", "size_mm": 3, "order": 2}})
+
+
+def cases(fast: bool) -> Iterator[Case]:
+    """Yield the press of the benchmark finger: the default mesh against the reference, or two element families."""
+    def case(what: str, unit: str, reference: float, source: str, compute: Callable[[], float]) -> Case:
+        return Case(name="press", quantity=f"benchmark finger, 10 mm deep: {what}", unit=unit, reference=reference,
+                    source=source, band=0.05, absolute=False, compute=compute)
+
+    if REFERENCE is not None:
+        yield case("force, standard", "N", REFERENCE, "converged with two element families", benchmark_force)
+    elif not fast:
+        yield case("force, hex8 2 mm over tet10 3 mm", "-", 1.0, "two element families agree", _families)
+
+
+def _families() -> float:
+    first, second = (benchmark_force(json.dumps(overrides)) for overrides in FAMILIES)
+    return first / second
+
+
+@cache
+def benchmark_force(overrides: str = "{}") -> float:
+    """Return the force [N] of the benchmark finger's press with some values changed, as JSON."""
+    from finqd.data import designs_folder
+    from finqd.design import Design
+    from finqd.presets import apply_preset
+
+    design = Design.from_json(designs_folder() / "benchmark.json").with_overrides(json.loads(overrides))
+    found = press_finger(apply_preset(design, "standard"))
+    if found.status != "ok":
+        raise Failed(f"{found.status}: {found.reason}")
+    return found.force

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,10 @@ from finqd.mechanics.material import Material
 from finqd.mechanics.state import State
 from finqd.mechanics.system import System
 from finqd.mesh_shapes import box_mesh
-from finqd.scene import Scene
+from finqd.scene import Scene, SoftBody
 from finqd.simulate import simulate
 from finqd.units import MM
-from finqd.verification.cases import Case, Failed, checked
+from finqd.verification.cases import Failed, checked
 
 SILICONE = Material(youngs_modulus=263_824, poisson_ratio=0.499, density=1070.0)
 STRIP = Material(youngs_modulus=1e7, poisson_ratio=0.0, density=1000.0)
@@ -44,7 +43,7 @@ ELASTICA = {1.0: (0.30172, 0.05643), 2.0: (0.49346, 0.16064), 4.0: (0.66996, 0.3
 @cache
 def elastica(load: float, divisions: tuple[int, int, int] = (50, 1, 1), element: str = "hex8",
              elasticity: str = "corotated") -> tuple[float, float]:
-    """Return deflection and shortening over L of the tip of a strip under a dead load P = ``load`` EI/L^2 at its tip."""
+    """Return deflection and shortening over L of a strip's tip under a dead load P = ``load`` EI/L^2 there."""
     mesh = box_mesh((LENGTH, WIDTH, DEPTH), divisions, element)
     scene = Scene(gravity=(0.0, 0.0, 0.0))
     strip = scene.add_soft(mesh, STRIP, elasticity=elasticity)
@@ -110,13 +109,15 @@ def roll_up(divisions: tuple[int, int, int] = (60, 1, 1), element: str = "hex8",
 # -- silicone ----------------------------------------------------------------------------------------------------------
 
 
-def silicone_scene(divisions: tuple[int, int, int], element: str, elasticity: str, force: float) -> tuple[Scene, Any]:
+def silicone_scene(
+    divisions: tuple[int, int, int], element: str, elasticity: str, force: float
+) -> tuple[Scene, SoftBody]:
     """Return a silicone bar, 100 x 30 x 30 mm, clamped at its root, with ``force`` [N] down on the tip's top edge."""
     scene = Scene(gravity=(0.0, 0.0, -9.807))
     mesh = box_mesh((100 * MM, 30 * MM, 30 * MM), divisions, element)
     beam = scene.add_soft(mesh, SILICONE, elasticity=elasticity)
     beam.fix("xmin")
-    edge = np.intersect1d(beam.vertices("xmax"), beam.vertices("zmax"))
+    edge = top_edge(beam)
     across = mesh.vertices[edge, 1]
     width = np.gradient(np.sort(across))  # a node's share of the edge, by the trapezoidal rule
     share = np.empty(len(edge))
@@ -125,9 +126,14 @@ def silicone_scene(divisions: tuple[int, int, int], element: str, elasticity: st
     return scene, beam
 
 
+def top_edge(beam: SoftBody) -> np.ndarray:
+    """Return the vertices of the tip's top edge, where the bar was measured (its markers were there)."""
+    return np.intersect1d(beam.vertices("xmax"), beam.vertices("zmax"))
+
+
 @cache
 def silicone_sag(divisions: tuple[int, int, int], force: float = 0.0, element: str = "hex8",
                  elasticity: str = "corotated") -> float:
-    """Return how far [m] the tip of the silicone bar sags at rest."""
+    """Return how far [m] the tip's top edge of the silicone bar sags at rest."""
     scene, beam = silicone_scene(divisions, element, elasticity, force)
-    return float(-at_rest(scene, beam.vertices("xmax"), time_step=0.1, steps=40)[2])
+    return float(-at_rest(scene, top_edge(beam), time_step=0.1, steps=40)[2])
