@@ -211,10 +211,13 @@ def _between(start: np.ndarray, end: np.ndarray, edges: int) -> np.ndarray:
 
 
 def _coons(bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Return the points (..., rows, columns, 2) between four sides, counter-clockwise (discrete Coons patch)."""
+    """Return the points (..., rows, columns, 2) between four sides, counter-clockwise (discrete Coons patch).
+
+    Opposite sides are blended by the arc length along the other two, so that graded sides do not skew the inside.
+    """
     top, left = top[..., ::-1, :], left[..., ::-1, :]
-    u = np.linspace(0.0, 1.0, bottom.shape[-2])[None, :, None]
-    v = np.linspace(0.0, 1.0, left.shape[-2])[:, None, None]
+    u = 0.5 * (_arc_shares(bottom) + _arc_shares(top))[..., None, :, None]
+    v = 0.5 * (_arc_shares(left) + _arc_shares(right))[..., :, None, None]
     ruled = (1 - v) * bottom[..., None, :, :] + v * top[..., None, :, :]
     ruled = ruled + (1 - u) * left[..., :, None, :] + u * right[..., :, None, :]
     for side, end, weight in ((bottom, 0, 1 - u), (bottom, -1, u)):
@@ -222,6 +225,13 @@ def _coons(bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndar
     for side, end, weight in ((top, 0, 1 - u), (top, -1, u)):
         ruled = ruled - weight * v * side[..., end, :][..., None, None, :]
     return ruled
+
+
+def _arc_shares(side: np.ndarray) -> np.ndarray:
+    """Return how far along a side (..., n, 2) its points lie, as shares (..., n) of its length."""
+    edges = np.linalg.norm(np.diff(side, axis=-2), axis=-1)
+    along = np.concatenate([np.zeros((*edges.shape[:-1], 1)), np.cumsum(edges, axis=-1)], axis=-1)
+    return along / along[..., -1:]
 
 
 def _cells(grid: np.ndarray) -> np.ndarray:
