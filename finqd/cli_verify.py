@@ -39,10 +39,12 @@ def verify(names: tuple[str, ...], fast: bool, with_grasps: bool, only_list: boo
         return 0
     click.echo(_line([title for title, _ in COLUMNS]))
     rows: list[Row] = []
+    source = ""
     with written_at_end(out, "--json") as write:
         for case in chosen:
             rows.append(measure(case))
-            _print(rows[-1])
+            _print(rows[-1], said=source)
+            source = rows[-1].source
         write(json.dumps([row.to_dict() for row in rows], indent=2, allow_nan=False) + "\n")
     missed = [row for row in rows if not row.passed]
     seconds = sum(row.seconds for row in rows)
@@ -50,14 +52,17 @@ def verify(names: tuple[str, ...], fast: bool, with_grasps: bool, only_list: boo
     return 1 if missed else 0
 
 
-def _print(row: Row) -> None:
+def _print(row: Row, *, said: str) -> None:
+    """Print a row, and below it its source unless that was ``said`` just now, and its note."""
     band = f"{row.band:.2g}" if row.absolute else f"{row.band:.1%}"
     error = f"{row.error:+.2g}" if row.absolute else f"{row.error:+.2%}"
     click.echo(_line([
         row.case, row.quantity, row.unit, f"{row.reference:.5g}", f"{row.value:.5g}", error, band,
         "ok" if row.passed else "MISSED", f"{row.seconds:.1f}",
     ]))
-    click.echo(f"{'':17s}{row.source}{'; ' if row.note else ''}{row.note}")
+    below = [text for text in (row.source if row.source != said else "", row.note) if text]
+    if below:
+        click.echo(f"{'':17s}{'; '.join(below)}")
 
 
 def _line(cells: list[str]) -> str:
