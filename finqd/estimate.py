@@ -189,19 +189,25 @@ def richardson(ratio: float, order: float) -> float:
 
 
 def _levels(evaluation: Evaluation) -> tuple[_Level, _Level]:
-    from finqd.evaluate import finger_meshes
-
     design = evaluation.design
     solids = [design.plugin("geometry").build(design.finger_si(i)) for i in range(len(design.fingers))]
+    longer = _step_level(design, solids)  # first: its meshes are those of the evaluation, which are kept for a while
+    return _mesh_level(evaluation, solids), longer
+
+
+def _step_level(design: Design, solids: Sequence[Any]) -> _Level:
+    """Return the level with steps twice as long; a stepper that chooses its own gets a looser tolerance too."""
+    from finqd.evaluate import finger_meshes
+
     settings = {f"protocol.{TIME_STEP}": min(STEP_FACTOR * design.protocol.time_step_ms, 1000.0)}
     tolerance = getattr(design.plugin("stepper"), "error_tolerance_mm", None)
     if tolerance is not None:  # the error of one step of an order q goes with the power q + 1 of its length
         settings["stepper.error_tolerance_mm"] = STEP_FACTOR ** (STEP_ORDER + 1) * tolerance
-    longer = _Level(
-        name=STEP_LEVEL, settings=settings, design=design.with_overrides(settings),
-        meshes=finger_meshes(design, solids),  # kept since the evaluation
-    )
-    return _mesh_level(evaluation, solids), longer
+    try:
+        longer, meshes = design.with_overrides(settings), finger_meshes(design, solids)
+    except (MeshError, InputError) as error:
+        return _Level(name=STEP_LEVEL, settings=settings, reason=f"no longer steps could be taken: {error}")
+    return _Level(name=STEP_LEVEL, settings=settings, design=longer, meshes=meshes)
 
 
 def _mesh_level(evaluation: Evaluation, solids: Sequence[Any]) -> _Level:
