@@ -275,17 +275,17 @@ def open_study(
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows that no other beats in both seconds and error, by seconds.
+    """Return the rows that no other beats in both seconds and error, by seconds; without the reference's own.
 
     Errors below what the reference is uncertain by count as equal, so that luck is not taken for accuracy.
 
-    >>> rows = [{"rung": n, "seconds": s, "resolved_percent": e, "status": "ok"}
+    >>> rows = [{"rung": n, "seconds": s, "resolved_percent": e, "knob": "size"}
     ...         for n, s, e in [("a", 1, 10), ("b", 2, 12), ("c", 3, 1), ("d", 4, 1)]]
     >>> [row["rung"] for row in front(rows)]
     ['a', 'c']
     """
     best, found = math.inf, []
-    usable = [row for row in rows if row["status"] == "ok" and row["resolved_percent"] is not None]
+    usable = [row for row in rows if row["resolved_percent"] is not None and row["knob"] != "reference"]
     for row in sorted(usable, key=lambda row: (row["seconds"], row["resolved_percent"])):
         if row["resolved_percent"] < best:
             best = row["resolved_percent"]

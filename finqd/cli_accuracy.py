@@ -167,8 +167,9 @@ def list_index(knob: str) -> int:
 
 def _print_answer(study: Study, question: str, row: Row | None) -> None:
     if row is None:
-        usable = [r for r in study.table() if r["status"] == "ok" and r["resolved_percent"] is not None]
-        nearest: Any = min(usable, key=lambda r: r["resolved_percent"], default=None)
+        from finqd.accuracy import front
+
+        nearest: Any = next(reversed(front(study.table())), None)
         least = ""
         if nearest is not None:
             cost = f"{nearest['resolved_percent']:.3g} % in {nearest['seconds']:.3g} s"
