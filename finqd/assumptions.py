@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from finqd.design_schema import DEFAULT_PLUGINS
+
 if TYPE_CHECKING:
     from finqd.design import Design
 
@@ -27,15 +29,22 @@ EFFECTS = {
 def effects_of(design: Design) -> dict[str, str]:
     """Return effect -> on or off, and why, of a design's simulations.
 
-    A plugin for elasticity, stepper or contact that does otherwise than the default ones says so in a class variable
-    ``effects``, a mapping of the same kind; an elasticity may declare ``small_rotation`` instead.
+    What other plugins than the default ones do is read off them: an elasticity may declare ``small_rotation = True``, a
+    stepper ``inertia = False``, and any of elasticity, stepper and contact a mapping ``effects`` of the same kind as
+    `EFFECTS`, which has the last word.
     """
     found = dict(EFFECTS)
+    elasticity, stepper = (design.spec(kind)["name"] for kind in ("elasticity", "stepper"))
+    if elasticity != DEFAULT_PLUGINS["elasticity"]:
+        small = getattr(design.plugin("elasticity"), "small_rotation", False)
+        found["large_rotation"] = f"{'off' if small else 'on'}: the elasticity {elasticity}"
+        found["material_nonlinearity"] = "off: linear elasticity" if small else f"as in the elasticity {elasticity}"
+    if stepper != DEFAULT_PLUGINS["stepper"]:
+        if not getattr(design.plugin("stepper"), "inertia", True):
+            found["inertia"] = f"off for the fingers: the stepper {stepper}; on for the object"
+        found["damping"] = f"off: only what the stepper {stepper} itself dissipates"
     for kind in ("elasticity", "stepper", "contact"):
-        plugin = design.plugin(kind)
-        if getattr(plugin, "small_rotation", False):
-            found["large_rotation"] = f"off: the elasticity {design.spec(kind)['name']} is for small rotations only"
-        found.update(getattr(plugin, "effects", {}))
+        found.update(getattr(design.plugin(kind), "effects", {}))
     return found
 
 

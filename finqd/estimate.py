@@ -1,17 +1,19 @@
 """How far off one result is likely to be: the same grasps again, one level away in mesh and in time step.
 
 Two companions run for every object, each away from the result in one thing only: a mesh whose elements are about half
-as long again, and steps twice as long. From the difference d to a companion whose elements (or steps) are rho times as
-long, Richardson's extrapolation takes the error of the result itself as d / (rho^p - 1), for a method of order p
-(Roache, J. Fluids Eng. 116, 1994). The spread is the sum of both, taken as absolute values.
+as long again, and steps twice as long (half as long where stability sets their length). From the difference d to a
+companion whose elements (or steps) are rho times as long, Richardson's extrapolation takes the error of the result
+itself as d / |rho^p - 1|, for a method of order p (Roache, J. Fluids Eng. 116, 1994). The spread is the sum of both,
+taken as absolute values.
 
-What is taken for the order: p = 1 in the mesh and q = 1 in the step, whatever the elements and the stepper. Both are
-second order or better where the solution is smooth; contact that comes and goes is not, and corners of ribs are not. A
-lower order makes the estimate larger.
+What is taken for the order: p = 1 in the mesh and q = 1 in the step, whatever the elements and the stepper. Both can be
+of second order or better where the solution is smooth; contact that comes and goes is not, and corners of ribs are not.
+A lower order makes the estimate larger.
 
 What is taken for rho: what came about, not what was asked for. In the mesh it is the cube root of the ratio of the
 numbers of elements (a profile of thin walls leaves a mesher little choice, and then a mesh for a larger size is hardly
-coarser); in time, the ratio of the numbers of steps, at most 2. If no coarser mesh is to be had, a finer one is taken.
+coarser); in time, the ratio of the numbers of steps, from 1/2 to 2. If no coarser mesh is to be had, a finer one is
+taken.
 
 An estimate is no bound. It sees what a coarser level sees: a grasp that slips only on much finer meshes escapes it.
 """
@@ -42,7 +44,7 @@ STEP_FACTOR = 2.0
 LEAST_RATIO = 1.15  # two levels nearer to each other than this say nothing about an error
 MESH_ORDER = 1.0
 STEP_ORDER = 1.0
-STEP_LEVEL = "longer_step"
+LONGER, SHORTER = "longer_step", "shorter_step"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,18 +198,32 @@ def _levels(evaluation: Evaluation) -> tuple[_Level, _Level]:
 
 
 def _step_level(design: Design, solids: Sequence[Any]) -> _Level:
-    """Return the level with steps twice as long; a stepper that chooses its own gets a looser tolerance too."""
+    """Return the level in time, on the meshes of the design itself."""
     from finqd.evaluate import finger_meshes
 
-    settings = {f"protocol.{TIME_STEP}": min(STEP_FACTOR * design.protocol.time_step_ms, 1000.0)}
-    tolerance = getattr(design.plugin("stepper"), "error_tolerance_mm", None)
+    name, settings = step_settings(design)
+    try:
+        changed, meshes = design.with_overrides(settings), finger_meshes(design, solids)
+    except (MeshError, InputError) as error:
+        return _Level(name=name, settings=settings, reason=f"no other steps could be taken: {error}")
+    return _Level(name=name, settings=settings, design=changed, meshes=meshes)
+
+
+def step_settings(design: Design) -> tuple[str, dict[str, Any]]:
+    """Return the level in time and its settings, as overrides.
+
+    Steps are twice as long; a stepper that chooses its own (``error_tolerance_mm``) gets a looser tolerance too. One
+    whose steps stability sets (``safety``) cannot take longer ones: there they are half as long.
+    """
+    stepper, dt = design.plugin("stepper"), design.protocol.time_step_ms
+    if hasattr(stepper, "safety"):
+        halves = {f"protocol.{TIME_STEP}": dt / STEP_FACTOR, "stepper.safety": stepper.safety / STEP_FACTOR}
+        return SHORTER, halves
+    settings = {f"protocol.{TIME_STEP}": min(STEP_FACTOR * dt, 1000.0)}
+    tolerance = getattr(stepper, "error_tolerance_mm", None)
     if tolerance is not None:  # the error of one step of an order q goes with the power q + 1 of its length
         settings["stepper.error_tolerance_mm"] = STEP_FACTOR ** (STEP_ORDER + 1) * tolerance
-    try:
-        longer, meshes = design.with_overrides(settings), finger_meshes(design, solids)
-    except (MeshError, InputError) as error:
-        return _Level(name=STEP_LEVEL, settings=settings, reason=f"no longer steps could be taken: {error}")
-    return _Level(name=STEP_LEVEL, settings=settings, design=longer, meshes=meshes)
+    return LONGER, settings
 
 
 def _mesh_level(evaluation: Evaluation, solids: Sequence[Any]) -> _Level:
@@ -253,10 +269,10 @@ def _companion(
     level: _Level, name: str, base: Trajectory, others: Mapping[tuple[str, str], Trajectory]
 ) -> Companion:
     trajectory = others.get((level.name, name), Trajectory(status="not_run", reason=level.reason))
-    if level.name != STEP_LEVEL:
+    if level.name not in (LONGER, SHORTER):
         return Companion(level=level.name, trajectory=trajectory, ratio=level.ratio, order=MESH_ORDER)
     steps = _steps(trajectory)
-    ratio = min(_steps(base) / steps, STEP_FACTOR) if steps else math.nan
+    ratio = min(max(_steps(base) / steps, 1 / STEP_FACTOR), STEP_FACTOR) if steps else math.nan
     return Companion(level=level.name, trajectory=trajectory, ratio=ratio, order=STEP_ORDER)
 
 

@@ -14,7 +14,15 @@ from finqd.assumptions import EFFECTS, effects_of
 from finqd.data import designs_folder
 from finqd.design import Design
 from finqd.errors import InputError, MeshError
-from finqd.estimate import LEAST_RATIO, Companion, estimate_error, estimate_object, mesh_settings, richardson
+from finqd.estimate import (
+    LEAST_RATIO,
+    Companion,
+    estimate_error,
+    estimate_object,
+    mesh_settings,
+    richardson,
+    step_settings,
+)
 from finqd.evaluate import evaluate
 from finqd.plugins.fitness_share_held import ShareHeld
 from finqd.plugins.mesher_swept import Swept
@@ -255,6 +263,15 @@ def test_a_tolerance_of_the_stepper_is_loosened_with_the_step(plain, monkeypatch
     assert tolerances == {10.0: 0.1, 20.0: pytest.approx(0.4)}
 
 
+def test_where_stability_sets_the_steps_they_are_halved():
+    explicit = benchmark().with_overrides({"stepper": "explicit", "protocol.time_step_ms": 10})
+    level, settings = step_settings(explicit)
+    safety = explicit.plugin("stepper").safety
+    assert level == "shorter_step" and settings == {"protocol.time_step_ms": 5.0, "stepper.safety": safety / 2}
+    assert step_settings(benchmark())[0] == "longer_step"
+    explicit.with_overrides(settings)
+
+
 def test_objects_that_are_not_the_evaluation_s_are_refused(plain):
     with pytest.raises(InputError, match="^objects: these are not the objects of the evaluation$"):
         estimate_error(plain, objects=["cube"])
@@ -263,10 +280,20 @@ def test_objects_that_are_not_the_evaluation_s_are_refused(plain):
 # -- effects ---------------------------------------------------------------------------------------
 
 
+def effects(**plugins) -> dict[str, str]:
+    return effects_of(benchmark().with_overrides(plugins))
+
+
 def test_the_effects_are_those_of_the_plugins_in_use(monkeypatch):
-    assert effects_of(benchmark()) == EFFECTS
-    monkeypatch.setattr(type(benchmark().plugin("elasticity")), "small_rotation", True, raising=False)
-    monkeypatch.setattr(type(benchmark().plugin("stepper")), "effects", {"inertia": "off: at rest"}, raising=False)
-    found = effects_of(benchmark())
-    assert found["large_rotation"].startswith("off") and found["inertia"] == "off: at rest"
-    assert found.keys() == EFFECTS.keys()
+    assert effects() == effects(stepper="implicit_euler", elasticity="corotated") == EFFECTS
+    small = effects(elasticity="linear")
+    assert small["large_rotation"] == "off: the elasticity linear"
+    assert small["material_nonlinearity"] == "off: linear elasticity"
+    assert effects(elasticity="neo_hookean")["large_rotation"] == "on: the elasticity neo_hookean"
+    assert "corotated" not in effects(elasticity="neo_hookean")["material_nonlinearity"]
+    still = effects(stepper="quasi_static")
+    assert still["inertia"].startswith("off for the fingers") and "quasi_static" in still["damping"]
+    second = effects(stepper="bdf2")
+    assert second["inertia"] == EFFECTS["inertia"] and "Euler" not in second["damping"]
+    monkeypatch.setattr(type(benchmark().plugin("contact")), "effects", {"friction": "off: oiled"}, raising=False)
+    assert effects()["friction"] == "off: oiled" and effects().keys() == EFFECTS.keys()
