@@ -62,18 +62,18 @@ def _rotation(fast: bool) -> Iterator[Case]:
 
 #: element -> bricks a side
 COOK_MESHES = {"hex8": 64, "hex20": 48, "tet10": 48, "wedge6": 48, "tet4": 48}
-COOK_FAST = {"hex8": 32, "hex20": 16, "tet10": 16, "wedge6": 8, "tet4": 8}
+COOK_FAST = {"hex8": 16, "hex20": 8, "tet10": 8, "wedge6": 16, "tet4": 16}
 LOCKED = (0.5 * (8.7 + 11.8) * MM, 0.5 * (11.8 - 8.7) * MM)
 
 
 def _cook(fast: bool) -> Iterator[Case]:
     for (element, n), nu in product((COOK_FAST if fast else COOK_MESHES).items(), (1 / 3, 0.4999)):
         if element not in ("wedge6", "tet4"):
-            value, band, source = (32.0 if nu < 0.4 else 28.0) * MM, 0.025 if fast else 0.015, "published"
+            value, band, source = (32.0 if nu < 0.4 else 28.0) * MM, 0.1 if fast else 0.015, "published"
         elif nu < 0.4:
-            value, band, source = 32.0 * MM, 0.35 if fast else 0.04, "published; linear simplices converge slowly"
+            value, band, source = 32.0 * MM, 0.15 if fast else 0.04, "published; linear simplices converge slowly"
         elif fast:
-            value, band, source = 7.4 * MM, 0.02, "this mesh: volumetric locking, far from 28"
+            value, band, source = 7.6 * MM, 0.03, "this mesh: volumetric locking, far from 28"
         else:
             value, band, source = LOCKED[0], LOCKED[1] / LOCKED[0], "published range 8.7 to 11.8: locks"
         yield _case("cook", f"{element}, {n} x {n}, nu {nu:.4g}: u_y", value, source, band, unit="m",
