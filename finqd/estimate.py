@@ -103,11 +103,11 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class _Level:
-    """Design and meshes of one companion, or why there is none."""
+    """Design and meshes of one companion; no meshes if there is none, for ``reason``."""
 
     name: str
     settings: Mapping[str, Any]
-    design: Design | None = None
+    design: Design
     meshes: tuple[Mesh, ...] = ()
     ratio: float = math.nan  # of element sizes; that of steps shows only afterwards
     reason: str = ""
@@ -130,7 +130,7 @@ def estimate_error(
     if [g.name for g in grasped] != list(base):
         raise InputError("these are not the objects of the evaluation", "objects")
     levels = _levels(evaluation) if any(t.status == "ok" for t in base.values()) else ()
-    runs = [(level, g) for g in grasped if base[g.name].status == "ok" for level in levels if level.design is not None]
+    runs = [(level, g) for g in grasped if base[g.name].status == "ok" for level in levels if level.meshes]
     tasks = [GraspTask(design=level.design, meshes=level.meshes, grasped=g) for level, g in runs]
     labels = [f"{g.name} ({level.name.replace('_', ' ')})" for level, g in runs]
     found = run_grasps(tasks, labels=labels, jobs=jobs, progress=progress) if tasks else []
@@ -205,7 +205,7 @@ def _step_level(design: Design, solids: Sequence[Any]) -> _Level:
     try:
         changed, meshes = design.with_overrides(settings), finger_meshes(design, solids)
     except (MeshError, InputError) as error:
-        return _Level(name=name, settings=settings, reason=f"no other steps could be taken: {error}")
+        return _Level(name=name, settings=settings, design=design, reason=f"no other steps could be taken: {error}")
     return _Level(name=name, settings=settings, design=changed, meshes=meshes)
 
 
@@ -246,7 +246,8 @@ def _mesh_level(evaluation: Evaluation, solids: Sequence[Any]) -> _Level:
         if max(ratio, 1 / ratio) >= LEAST_RATIO and (ratio > 1) == (factor > 1):
             return _Level(name=name, settings=settings, design=changed, meshes=meshes, ratio=ratio)
         reason = f"{count} elements instead of {elements} are no other level"
-    return _Level(name="coarser_mesh", settings=settings, reason=f"no other mesh could be made: {reason}")
+    reason = f"no other mesh could be made: {reason}"
+    return _Level(name="coarser_mesh", settings=settings, design=design, reason=reason)
 
 
 def mesh_settings(mesher: Any, factor: float) -> dict[str, Any]:
