@@ -132,6 +132,8 @@ def run(arguments: argparse.Namespace, wanted: list[Pair]) -> dict[Grasp, dict[s
     """Simulate what the log does not hold yet, until the time is up; return all rows."""
     log, known = Path(arguments.log), designs()
     rows = read_log(log, known, arguments.limit_s)
+    if log.exists() and not log.read_text().endswith("\n"):
+        log.write_text(log.read_text() + "\n")  # the line that a kill cut short must not swallow the next
     deadline = time.time() + 60.0 * arguments.budget_minutes
     estimated = {pair.ours for pair in wanted if pair.suite != "paper"}
     todo = dict.fromkeys(grasp for pair in wanted for grasp in (pair.ours, pair.other))
