@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 DPI = 130
 INK, SOFT, FRONT, PRESET = "#222222", "#999999", "#111111", "#c1121f"
-#: a curve's colour says what is turned, its mark which of several it is
+#: element families have colours of their own; else a colour says what is turned, and a mark which of several it is
+FAMILIES = {"size of tet4": "#d62828", "size of tet10": "#e07a1f", "size of hex20": "#0b3c8c"}
 COLOURS = {
     "size": "#1f6f8b", "element": "#e07a1f", "step": "#2a9d4a", "adaptive": "#7fbf3f", "stepper": "#8e5bb5",
     "newton": "#b58b00", "linear": "#5c7fd6", "contact": "#d1699b", "elasticity": "#7a5230",
@@ -29,16 +30,20 @@ def draw(study: Study, path: Path) -> None:
     figure = Figure(figsize=(12.5, 7.2), layout="constrained")
     axes = figure.add_subplot()
     axes.set(xscale="log", yscale="log")
+    axes.margins(0.07, 0.1)
     lowest = _lowest(study, rows)
     for colour, mark, name, line in _curves(study, rows):
         points = [(row["seconds"], max(abs(row["error_percent"]), lowest)) for row in line]
-        axes.plot(*zip(*points), color=colour, marker=mark, markersize=5.5, linewidth=1.3, alpha=0.85, label=name)
+        width = 2.0 if name.startswith("size of") else 1.1
+        axes.plot(*zip(*points), color=colour, marker=mark, markersize=5.5, linewidth=width, alpha=0.85, label=name)
     best = [(row["seconds"], max(row["resolved_percent"], lowest)) for row in front(rows)]
     if best:
         axes.plot(*zip(*best), color=FRONT, linewidth=5, alpha=0.22, solid_capstyle="round", label="Pareto front")
-    presets = {row["rung"]: row for row in rows if row["knob"] == "preset"}
-    _mark_presets(axes, presets, lowest)
+    marked = [(row["seconds"], max(abs(row["error_percent"]), lowest)) for row in rows if row["knob"] == "preset"]
+    if marked:
+        axes.plot(*zip(*marked), linestyle="")  # makes room for them
     _dress(axes, study)
+    _mark_presets(axes, {row["rung"]: row for row in rows if row["knob"] == "preset"}, lowest)
     figure.savefig(path, dpi=DPI)
 
 
@@ -51,7 +56,8 @@ def _curves(study: Study, rows: Sequence[Row]) -> list[tuple[str, str, str, list
     drawn, used = [], dict.fromkeys(COLOURS, 0)
     for name, line in sorted(series.items(), key=lambda item: list(COLOURS).index(item[1][0]["knob"])):
         knob = line[0]["knob"]
-        drawn.append((COLOURS[knob], MARKS[used[knob] % len(MARKS)], name, sorted(line, key=_setting)))
+        colour, mark = FAMILIES.get(name, COLOURS[knob]), MARKS[used[knob] % len(MARKS)]
+        drawn.append((colour, mark, name, sorted(line, key=_setting)))
         used[knob] += 1
     return drawn
 
@@ -72,8 +78,10 @@ def _lowest(study: Study, rows: Sequence[Row]) -> float:
 
 def _mark_presets(axes: Axes, presets: Mapping[str, Row], lowest: float) -> None:
     above = True
+    low, high = axes.get_ylim()
     for name, row in sorted(presets.items(), key=lambda item: item[1]["seconds"]):
         point = (row["seconds"], max(abs(row["error_percent"]), lowest))
+        above = above or point[1] < low * (high / low) ** 0.15  # there is no room below
         text = "the paper's setting" if name == "paper" else name
         told = f"{text}\n{abs(row['error_percent']):.2g} %, {row['seconds']:.2g} s"
         axes.plot(*point, marker="*", markersize=17, color=PRESET, markeredgecolor="white", linestyle="", zorder=9)
@@ -107,7 +115,6 @@ def _dress(axes: Axes, study: Study) -> None:
     axes.grid(which="minor", color="#eeeeee", linewidth=0.4)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.margins(0.07, 0.1)
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         axes.legend(handles, labels, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
