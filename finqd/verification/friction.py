@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,7 @@ def rolling_ball(angle_deg: float, *, time_step: float, duration: float = 0.5) -
     return mean_acceleration(found.times, found.rigid_positions[:, 0, 0]) / (5 / 7 * GRAVITY * math.sin(angle))
 
 
+@cache
 def squeezed_block(
     mass: float, *, friction: float = 0.6, divisions: tuple[int, int, int] = (3, 4, 4), time_step: float = 0.01
 ) -> tuple[float, float]:

@@ -25,7 +25,7 @@ DEPTH = 0.02  # of the strip, in the direction in which it bends [m]
 WIDTH = 0.02
 BENDING = STRIP.youngs_modulus * WIDTH * DEPTH**3 / 12  # EI [N m^2]
 PERIOD = 2 * np.pi / 3.516 * LENGTH**2 * np.sqrt(STRIP.density * WIDTH * DEPTH / BENDING)  # of its first mode [s]
-PRECISE = {"tolerance_N": 1e-8, "linear_tolerance": 1e-8, "max_iterations": 100}
+PRECISE = {"tolerance_N": 1e-7, "linear_tolerance": 1e-8, "max_iterations": 100}
 
 
 def resting(name: str = "") -> dict[str, Any]:
