@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from finqd import registry
 from finqd.cli import finqd
 from finqd.data import designs_folder
 from finqd.design import Design
@@ -43,6 +44,15 @@ def test_a_fast_twin_stays_inside_its_bands(name: str) -> None:
 @pytest.mark.parametrize("name", [*FAST, "press"])
 def test_a_case_stays_inside_its_bands(name: str) -> None:
     assert not missed([measure(case) for case in cases([name])])
+
+
+@pytest.mark.parametrize("element", elastic.ELEMENTS)
+def test_all_laws_agree_for_small_strains(element: str) -> None:
+    names = [name for name in registry.names("elasticity") if elastic.supported(name, element)]
+    assert "corotated" in names
+    for nu in (1 / 3, 0.4999):
+        found = [elastic.cook(element, 4, nu, name) for name in names]
+        assert found == pytest.approx([found[0]] * len(found), rel=1e-7)
 
 
 # -- the harness -------------------------------------------------------------------------------------------------------
