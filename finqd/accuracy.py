@@ -34,7 +34,14 @@ LOG, REFERENCE = "accuracy.jsonl", "reference.json"
 DEAR_S, DEAR_TIMES = 40.0, 4.0  # rungs expected to take longer, and that many times `standard`, need a full ladder;
 PRESET_TIMES = 5.0  # the presets only if they are expected to take that many times longer still
 REFERENCE_LIMITS = 6.0  # a rung of the reference may take that many times the limit of another
+UNDISTURBED = 0.6  # share of its time that a rung has the processor, meshing in another process set aside
 MARGIN = 1.5  # for a budget, rungs expected to take up to this many times as long are tried
+
+#: what a row must hold; one that another version of finqd logged without it is run again
+ROW_KEYS = {
+    *measured(status="", reason=""), "wall_seconds", "cpu_seconds", "machine", "date", "limit_s", "jobs", "design",
+    "versions", "options", "rung",
+}
 
 Row = dict[str, Any]
 
@@ -50,10 +57,10 @@ class RungTask:
 
 
 def measure_rung(task: RungTask, *, progress: Callable[[float], None] | None = None) -> dict[str, Any]:
-    """Run one rung here; the whole time it took is ``wall_seconds``."""
-    begun = clock.perf_counter()
+    """Run one rung here; the whole time it took is ``wall_seconds``, that of the processor ``cpu_seconds``."""
+    begun, busy = clock.perf_counter(), clock.process_time()
     found = task.measure(task.design, task.options, task.limit, progress)
-    return {**found, "wall_seconds": clock.perf_counter() - begun}
+    return {**found, "wall_seconds": clock.perf_counter() - begun, "cpu_seconds": clock.process_time() - busy}
 
 
 @dataclass(kw_only=True)
@@ -120,7 +127,7 @@ class Study:
 
     def _row(self, rung: Rung, task: RungTask, result: Any) -> Row:
         if isinstance(result, TaskFailure):
-            result = {**measured(status=result.kind, reason=result.reason), "wall_seconds": None}
+            result = {**measured(status=result.kind, reason=result.reason), "wall_seconds": None, "cpu_seconds": None}
         return {
             "rung": rung.name, "knob": rung.knob, "series": rung.series, "case": self.case.name,
             "preset": rung.preset, "settings": dict(rung.settings), "options": options_text(rung.preset, rung.settings),
@@ -178,7 +185,7 @@ class Study:
         """
         key = self.key(rung)
         for row in reversed(self.rows):
-            if row.get("key") == key:
+            if row.get("key") == key and row.keys() >= ROW_KEYS:
                 late = row["status"] == "timeout" and limit is not None and limit > row.get("limit_s", 0.0)
                 return None if row["status"] == "crash" or late else row
         return None
@@ -322,6 +329,15 @@ def best_within(study: Study, budget_s: float) -> Row | None:
             study.run([rung], limit=min(study.limit, 2.0 * budget_s + 30.0))
     fits = [row for row in front(study.table()) if row["seconds"] <= budget_s]
     return fits[-1] if fits else None
+
+
+def disturbed(rows: Sequence[Row]) -> list[str]:
+    """Return the rungs that had the processor for less than `UNDISTURBED` of their time: other work was going on."""
+    return [
+        row["rung"] for row in rows
+        if row["status"] == "ok" and row["seconds"] > 1.0 and row.get("cpu_seconds") is not None
+        and row["cpu_seconds"] < UNDISTURBED * row["wall_seconds"]
+    ]
 
 
 def fingerprint(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,12 +11,13 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from finqd.accuracy import Row, Study, front
+from finqd.accuracy import Row, Study, disturbed, front
 from finqd.accuracy_ladder import KNOBS
 from finqd.runlog import write_whole
 
 COLUMNS = (
-    "rung", "knob", "series", "status", "error_percent", "change_percent", "seconds", "wall_seconds", "dofs", "steps",
+    "rung", "knob", "series", "status", "error_percent", "change_percent", "seconds", "wall_seconds", "cpu_seconds",
+    "dofs", "steps",
     "newton_iterations", "max_penetration_mm", "on_front",
 )
 STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;background:#fff;max-width:1150px;margin:2em auto;
@@ -200,6 +201,9 @@ def _origin(study: Study, rows: Sequence[Row]) -> str:
     warning = "<p><b>The seconds come from more than one machine.</b></p>" if len(machines) > 1 else ""
     if any(row.get("jobs", 1) > 1 for row in rows):
         warning += "<p><b>Rungs ran side by side (--jobs): their seconds are longer than alone.</b></p>"
+    if late := disturbed(rows):
+        told_late = f"The machine was busy with other work during {len(late)} rungs: their seconds are too long."
+        warning += f"<p><b>{told_late}</b></p>"
     dates = sorted(row["date"] for row in rows)
     when = f"{dates[0]} to {dates[-1]} UTC" if dates else ""
     return (f"<h2>Where this comes from</h2>{warning}<p>{escape(when)}. One process a rung, one thread; seconds of "

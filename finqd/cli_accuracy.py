@@ -67,7 +67,7 @@ def accuracy(
 
 def _answer(study: Study, reference: str | Reference, percent: float | None, seconds: float | None) -> int:
     """Run what is asked for, print it, and return the exit code: 1 if there is no answer."""
-    from finqd.accuracy import REFERENCE, best_within, cheapest_within
+    from finqd.accuracy import REFERENCE, best_within, cheapest_within, disturbed
     from finqd.accuracy_reference import write_reference
     from finqd.accuracy_report import write_report
 
@@ -85,6 +85,9 @@ def _answer(study: Study, reference: str | Reference, percent: float | None, sec
     if not answers:
         study.run(study.rungs)
         _print_table(study)
+    if late := disturbed(study.table()):
+        click.echo(f"finqd: the machine was busy with other work during {len(late)} rungs: their seconds are too long",
+                   err=True)
     for path in write_report(study):
         click.echo(path)
     for question, row in answers:

@@ -17,6 +17,7 @@ from finqd.accuracy import (
     REFERENCE,
     best_within,
     cheapest_within,
+    disturbed,
     fingerprint,
     front,
     measure_rung,
@@ -219,6 +220,17 @@ def test_other_versions_are_run_again(study_in, tmp_path):
     other.__dict__["versions"] = {**study.versions, "numpy": "0.1"}
     other.run(other.rungs)
     assert len(other.runner.ran) == len(study.runner.ran)
+
+
+def test_a_row_that_lacks_something_is_run_again(study_in, tmp_path):
+    study = study_in(tmp_path, knobs=["step"])
+    study.run(study.rungs)
+    rows = read_rows(tmp_path / LOG)
+    del rows[0]["wall_seconds"], rows[1]["values"]
+    (tmp_path / LOG).write_text("".join(json.dumps(row) + "\n" for row in rows))
+    again = study_in(tmp_path, knobs=["step"])
+    again.run(again.rungs)
+    assert len(again.runner.ran) == 2
 
 
 def test_what_crashed_or_now_has_more_time_is_run_again_and_what_diverged_is_not(study_in, tmp_path):
@@ -500,6 +512,11 @@ def test_a_real_press_in_a_process_of_its_own(design, tmp_path):
     assert 0.0 < row["max_penetration_mm"] < 0.1 and row["values"]["energy_mJ"] > 0.0
     other = open_study(design.with_overrides(coarse), CASES["press"], {"finger": 0}, tmp_path, knobs=["size"])
     assert other.row_of(rung) == {**row, "errors": {}}  # read from the log
+
+
+def test_rungs_that_shared_the_processor_are_told_of():
+    row = {"status": "ok", "seconds": 5.0, "wall_seconds": 6.0, "cpu_seconds": 5.8, "rung": "calm"}
+    assert disturbed([row, {**row, "cpu_seconds": 2.0, "rung": "late"}, {**row, "cpu_seconds": None}]) == ["late"]
 
 
 def test_options_are_written_as_a_shell_takes_them():
