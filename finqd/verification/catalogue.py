@@ -92,7 +92,7 @@ def _mesh_order(fast: bool) -> Iterator[Case]:
     for name, element in product(["corotated"] if fast else registry.names("elasticity"), elastic.ELEMENTS):
         if elastic.supported(name, element):
             order = 3.0 if element in elastic.QUADRATIC else 2.0
-            sizes = (3, 6) if element in elastic.QUADRATIC else (4, 8) if fast else (8, 16)
+            sizes = (3, 6) if element in elastic.QUADRATIC else (4, 8) if fast else (6, 12)
             yield _case("mesh-order", f"{name}, {element}: order of the L2 error", order, "degree + 1", 0.15,
                         absolute=True, compute=partial(_mesh_rate, element, sizes, name))
 
