@@ -94,12 +94,13 @@ def _mark_presets(axes: Axes, presets: Mapping[str, Row], lowest: float) -> None
 
 
 def _dress(axes: Axes, study: Study) -> None:
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import FuncFormatter, LogFormatter
 
     quantity = study.case.quantities[study.case.main]
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_major_formatter(plain)
     axes.yaxis.set_major_formatter(plain)
+    axes.xaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.5, 0.5)))
     axes.set_xlabel("seconds on one core (without meshing and compiling)", color=INK)
     axes.set_ylabel(f"error of the {quantity.label} [%]", color=INK)
     axes.set_title(f"{study.case.title}: {study.design.name}", fontsize=12, color=INK)
