@@ -42,6 +42,9 @@ CASES: dict[str, tuple[dict, tuple[float | None, float | None], float | None]] =
     "tet10 2": ({"name": "tetrahedral", "size_mm": 2.0, "order": 2}, (14.95, 15.28), 0.02),
     "hex8 4": ({"name": "swept", "size_mm": 4.0}, (14.13, 14.42), 0.05),
     "hex8 2": ({"name": "swept", "size_mm": 2.0}, (15.52, 15.97), None),
+    "hex20 6": ({"name": "swept", "size_mm": 6.0, "order": 2}, (13.36, None), None),
+    "hex20 4": ({"name": "swept", "size_mm": 4.0, "order": 2}, (None, None), None),
+    "hex20 2": ({"name": "swept", "size_mm": 2.0, "order": 2}, (None, None), None),
 }
 PROFILES = ("right", "isosceles")
 

@@ -10,6 +10,7 @@ import scipy.sparse.linalg as sla
 from scipy.spatial.transform import Rotation
 
 from finqd.errors import InputError
+from finqd.mechanics import element_stiffness
 from finqd.mechanics.loads import face_tractions
 from finqd.mechanics.material import Material
 from finqd.mechanics.pattern import BlockPattern
@@ -294,6 +295,29 @@ def test_a_distorted_patch_takes_a_linear_field_exactly(name):
     exact = mesh.vertices @ np.random.default_rng(1).standard_normal((3, 3)) * 1e-3
     found = displacements(mesh, RUBBER, np.zeros_like(exact), boundary, exact[boundary])
     assert np.abs(found - exact)[inner].max() < 1e-10 * np.abs(exact).max()
+
+
+def crooked_patch_error(name: str) -> float:
+    """Relative error of a linear field in a patch whose inner edges are curved too."""
+    mesh, boundary = patch(name)
+    inner = np.setdiff1d(np.arange(mesh.n_vertices), boundary)
+    vertices = mesh.vertices.copy()
+    vertices[inner] += 6e-4 * np.random.default_rng(3).uniform(-1, 1, (len(inner), 3))
+    mesh = Mesh(vertices, mesh.blocks)
+    exact = vertices @ np.random.default_rng(1).standard_normal((3, 3)) * 1e-3
+    found = displacements(mesh, RUBBER, np.zeros_like(exact), boundary, exact[boundary])
+    return float(np.abs(found - exact)[inner].max() / np.abs(exact).max())
+
+
+@pytest.mark.parametrize("name", ["hex20", "tet10"])
+def test_curved_edges_pass_the_patch_test_by_corrected_gradients_only(name, monkeypatch):
+    """With straight edges the reduced rules are exact; with curved ones the plain rule is the twin that fails."""
+    def plain(kind, vertices, *, start=0):
+        return element_stiffness.physical_gradients(kind, vertices, kind.points, kind.weights)
+
+    assert crooked_patch_error(name) < 1e-10
+    monkeypatch.setattr(element_stiffness, "consistent_gradients", plain)
+    assert crooked_patch_error(name) > 1e-6
 
 
 @pytest.mark.parametrize("name", TYPES)

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from finqd.errors import InputError, MeshError
-from finqd.mechanics.element_stiffness import isotropic, rest_elements, strain_matrix
+from finqd.mechanics.element_stiffness import (
+    consistent_gradients,
+    hourglass_matrix,
+    isotropic,
+    physical_gradients,
+    rest_elements,
+    strain_matrix,
+)
 from finqd.mechanics.elements import ELEMENTS, FACES, element, element_rule, face_shape, face_shape_gradients
 from finqd.mechanics.loads import face_tractions
 from finqd.mechanics.mass import lumped_masses
@@ -133,6 +140,46 @@ def test_stiffness_has_the_energy_of_a_uniform_strain(name):
     np.testing.assert_allclose(np.einsum("ai,aj->ij", vertices, elements.gradients[0]), np.eye(3), atol=1e-12)
 
 
+def curved(name: str) -> np.ndarray:
+    """Rest nodes (1, k, 3) of an element with crooked edges."""
+    nodes = ELEMENTS[name].nodes
+    return (nodes + 0.08 * np.random.default_rng(5).standard_normal(nodes.shape))[None]
+
+
+@pytest.mark.parametrize("name", ["hex20", "tet10"])
+def test_gradients_have_the_exact_mean_and_keep_linear_fields(name):
+    kind, vertices = ELEMENTS[name], curved(name)
+    fine, volumes = physical_gradients(kind, vertices, *element_rule(name, 5))
+    exact = np.einsum("nq,nqak->nak", volumes, fine)
+    gradients, weights = consistent_gradients(kind, vertices)
+    assert weights.sum() == pytest.approx(volumes.sum(), rel=1e-13)
+    np.testing.assert_allclose(np.einsum("nq,nqak->nak", weights, gradients), exact, atol=1e-13)
+    fields = np.einsum("nai,nqak->nqik", vertices, gradients)
+    np.testing.assert_allclose(fields, np.broadcast_to(np.eye(3), fields.shape), atol=1e-12)
+    plain, raw = physical_gradients(kind, vertices, kind.points, kind.weights)  # the twin without the correction
+    assert np.abs(np.einsum("nq,nqak->nak", raw, plain) - exact).max() > 1e-4
+
+
+@pytest.mark.parametrize("shape", ["brick", "crooked"])
+def test_hourglasses_of_hex20_cost_energy_and_linear_fields_none(shape):
+    kind = ELEMENTS["hex20"]
+    vertices = kind.nodes[None] if shape == "brick" else curved("hex20")
+    gradients, weights = consistent_gradients(kind, vertices)
+    matrix = hourglass_matrix(kind, vertices, gradients, weights)[0]
+    assert np.linalg.eigvalsh(matrix)[0] > -1e-14
+    assert np.abs(matrix @ np.column_stack([np.ones(20), vertices[0]])).max() < 1e-14
+    if shape == "brick":
+        assert np.abs(matrix @ (kind.nodes[:, :1] * kind.nodes)).max() < 1e-14  # nor quadratic ones
+    x, y = kind.nodes[:, 0], kind.nodes[:, 1]
+    mode = np.stack([x * (3 * y**2 - 1), -y * (3 * x**2 - 1), 0 * x], axis=1)  # strains vanish at the four points
+    field = mode.ravel()
+    stiffness = rest_elements("hex20", vertices, LAME).stiffness[0]
+    resistance = field @ stiffness @ field
+    assert resistance > 1e-4 * LAME[1] * np.sum(field**2)
+    if shape == "brick":
+        assert resistance == pytest.approx(LAME[1] * np.einsum("ai,ab,bi", mode, matrix, mode), rel=1e-9)
+
+
 def test_an_inverted_element_is_named():
     mesh = box_mesh((1.0, 1.0, 1.0), (2, 1, 1))
     nodes = mesh.vertices[mesh.blocks["hex8"]]
@@ -186,6 +233,37 @@ def test_a_region_that_cuts_faces_converges_to_its_area(name):
         errors.append(abs(forces[:, 1].sum() / (0.0137 * 0.02) - 1))
     assert errors[-1] < 5e-3
     assert all(error < 0.5 / cells for error, cells in zip(errors, (4, 16, 64)))
+
+
+@pytest.mark.parametrize("below", ["plane", "sphere"])
+@pytest.mark.parametrize("name", ["hex8", "hex20"])
+def test_a_block_rests_with_its_weight_and_without_jitter(name, below):
+    """Contact on eight-node faces, whose corner shape functions are negative in the middle."""
+    from finqd.mechanics.material import Material
+    from finqd.objects import load_object
+    from finqd.scene import Scene
+    from finqd.simulate import simulate
+
+    scene, size = Scene(gravity=(0.0, 0.0, -9.81)), np.array([0.03, 0.02, 0.01])
+    placed = np.eye(4)
+    placed[:3, 3] = -size / 2 * [1, 1, 0]
+    scene.add_soft(box_mesh(size, (3, 2, 1), name).transformed(placed),
+                   Material(youngs_modulus=1e6, poisson_ratio=0.45, density=1000.0))
+    if below == "plane":
+        scene.add_plane()
+    else:
+        scene.add_rigid(load_object("sphere"), position=(0.0, 0.0, -0.02), held=True)
+    seen = []
+
+    def watch(system, state):
+        force = system.contact.soft_forces[0] if below == "plane" else -system.contact_forces_on_rigid(state)[0, 2]
+        seen.append((float(force), state.positions))
+
+    trajectory = simulate(scene, duration=0.4, time_step=0.01, watch=watch)
+    assert trajectory.status == "ok", trajectory.reason
+    weight = 9.81 * 1000.0 * size.prod()
+    assert [force for force, _ in seen[-5:]] == pytest.approx([weight] * 5, rel=1e-3)
+    assert max(np.abs(positions - seen[-1][1]).max() for _, positions in seen[-10:]) < 1e-7
 
 
 def test_an_unknown_face_set_lists_the_known_ones():

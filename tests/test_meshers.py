@@ -15,6 +15,7 @@ from scipy.stats import qmc
 from test_geometry_fin_ray import BENCHMARK, sobol_fingers
 
 from finqd.errors import InputError, MeshError
+from finqd.mechanics.mass import lumped_masses
 from finqd.mesh import Mesh
 from finqd.meshing import close_mesher, mesh_solid
 from finqd.plugins.geometry_fin_ray import FinRay
@@ -134,6 +135,26 @@ def test_second_order_tetrahedra_have_straight_edges_and_vtk_order() -> None:
     nodes = mesh.vertices[mesh.blocks["tet10"]]
     for middle, (a, b) in enumerate([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)], start=4):
         assert np.array_equal(nodes[:, middle], 0.5 * (nodes[:, a] + nodes[:, b]))
+
+
+def test_second_order_hexahedra_have_straight_edges_and_the_same_regions() -> None:
+    solid = FinRay().build(BENCHMARK)
+    linear, mesh = Swept(size_mm=6.0).mesh(solid), Swept(size_mm=6.0, order=2).mesh(solid)
+    assert_good_mesh(mesh, solid, worst=0.2)
+    assert set(mesh.blocks) == {"hex20"} and set(mesh.faces) == {"quad8"}
+    assert np.array_equal(mesh.blocks["hex20"][:, :8], linear.blocks["hex8"])
+    nodes = mesh.vertices[mesh.blocks["hex20"]]
+    edges = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+    for middle, (a, b) in enumerate(edges, start=8):
+        assert np.array_equal(nodes[:, middle], 0.5 * (nodes[:, a] + nodes[:, b]))
+    for name in ("base", "contact"):
+        assert face_area(mesh, name) == pytest.approx(face_area(linear, name), rel=1e-12)
+        assert set(linear.node_sets[name]) < set(mesh.node_sets[name])
+    assert np.abs(mesh.vertices[mesh.node_sets["base"], 1]).max() == 0.0
+    assert lumped_masses(mesh, 1150.0).min() > 0.0
+    paved = replace(solid, patches=None)
+    with pytest.raises(MeshError, match="triangles, and there are no quadratic wedges"):
+        Swept(order=2).mesh(paved)
 
 
 @pytest.mark.parametrize("contact_line", [None, TRAPEZOID.contact_line])
