@@ -187,7 +187,8 @@ def _mode() -> tuple[Any, np.ndarray, float]:
     scene.add_soft(mesh, RUBBER).fix("xmin")
     system = System(scene, contact=registry.create("contact", "penalty"))
     free = ~system.fixed.ravel()
-    matrix = stiffness(mesh, system.potentials[0], mesh.vertices).toarray()[np.ix_(free, free)]
+    pattern, blocks = stiffness(mesh, system.potentials[0], mesh.vertices)
+    matrix = pattern.matrix(blocks).toarray()[np.ix_(free, free)]
     squares, vectors = la.eigh(matrix, np.diag(np.repeat(system.masses, 3)[free]), subset_by_index=(0, 0))
     shape = np.zeros(3 * mesh.n_vertices)
     shape[free] = vectors[:, 0] / np.abs(vectors[:, 0]).max()
@@ -252,7 +253,8 @@ def silicone_modal_peak(divisions: tuple[int, int, int], duration: float = 0.12)
     system = System(scene, contact=registry.create("contact", "penalty"))
     free = ~system.fixed.ravel()
     roots = np.sqrt(np.repeat(system.masses, 3)[free])
-    matrix = stiffness(beam.mesh, system.potentials[0], beam.mesh.vertices).toarray()[np.ix_(free, free)]
+    pattern, blocks = stiffness(beam.mesh, system.potentials[0], beam.mesh.vertices)
+    matrix = pattern.matrix(blocks).toarray()[np.ix_(free, free)]
     squares, vectors = la.eigh(matrix / np.outer(roots, roots))
     watched = np.zeros((beam.mesh.n_vertices, 3))
     watched[top_edge(beam), 2] = -1.0 / len(top_edge(beam))

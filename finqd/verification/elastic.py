@@ -12,8 +12,10 @@ import numpy as np
 
 from finqd import registry
 from finqd.errors import InputError
+from finqd.mechanics.assembly_kernels import hold
 from finqd.mechanics.elements import element as reference_element
 from finqd.mechanics.elements import element_rule
+from finqd.mechanics.linear_backends import create_factorisation
 from finqd.mechanics.loads import face_tractions
 from finqd.mechanics.material import Material
 from finqd.mechanics.pattern import BlockPattern
@@ -40,32 +42,35 @@ def potential_of(mesh: Mesh, material: Material, elasticity: Any) -> Any:
     return elasticity.potential(mesh, material)
 
 
-def stiffness(mesh: Mesh, potential: Any, positions: np.ndarray) -> Any:
-    """Return the Hessian at ``positions`` as a sparse matrix (3 n_vertices, 3 n_vertices) [N/m]."""
+def stiffness(mesh: Mesh, potential: Any, positions: np.ndarray) -> tuple[BlockPattern, np.ndarray]:
+    """Return the Hessian at ``positions`` [N/m]: its pattern and its blocks (n_blocks, 3, 3)."""
     pattern = BlockPattern.from_cliques(mesh.n_vertices, potential.cliques)
     blocks = np.zeros((pattern.n_blocks, 3, 3))
     potential.add_hessian(positions, tuple(pattern.slots(nodes) for nodes in potential.cliques), blocks)
-    return pattern.matrix(blocks).tocsr()
+    return pattern, blocks
 
 
-def solve(matrix: Any, right: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Solve matrix u = right (n, 3) where the dofs ``fixed`` (n, 3) bool have the ``values`` (n, 3); return u."""
-    import qdldl
-    import scipy.sparse as sp
-
-    free = np.flatnonzero(~fixed.ravel())
+def solve(
+    hessian: tuple[BlockPattern, np.ndarray], right: np.ndarray, fixed: np.ndarray, values: np.ndarray
+) -> np.ndarray:
+    """Solve hessian u = right (n, 3) where the dofs ``fixed`` (n, 3) bool have the ``values`` (n, 3); return u."""
+    pattern, blocks = hessian
+    matrix, free = pattern.matrix(blocks), ~fixed.ravel()
     found = np.where(fixed, values, 0.0).ravel()
-    load = (right.ravel() - matrix @ found)[free]
-    inner = matrix[free][:, free]
-    solver = qdldl.Solver(sp.triu(inner, format="csc"), upper=True)
-    step = solver.solve(load)
-    step += solver.solve(load - inner @ step)
-    left = np.linalg.norm(inner @ step - load)
-    backward = left / (np.abs(inner.data).max() * np.linalg.norm(step) + np.linalg.norm(load) + 1e-300)
+    load = np.where(free, right.ravel() - matrix @ found, 0.0)
+    held = blocks.copy()
+    hold(pattern.indptr, pattern.indices, fixed, held, np.zeros((fixed.size, 0)))
+    factors = create_factorisation("auto", pattern)
+    if not factors.factorise(held):
+        raise Failed("the stiffness is not positive definite")
+    step = np.zeros_like(load)
+    for _ in range(2):  # the second time refines, for nearly incompressible materials
+        step += np.where(free, factors.solve((load - np.where(free, matrix @ step, 0.0))[:, None])[:, 0], 0.0)
+    left = np.linalg.norm((matrix @ step - load)[free])
+    backward = left / (np.abs(blocks).max() * np.linalg.norm(step) + np.linalg.norm(load) + 1e-300)
     if not backward < 1e-12:
         raise Failed(f"the direct solver left a backward error of {backward:.1e}")
-    found[free] = step
-    return found.reshape(-1, 3)
+    return (found + step).reshape(-1, 3)
 
 
 def supported(elasticity: str, element: str) -> bool:
