@@ -21,7 +21,7 @@ from finqd.meshing import close_mesher, mesh_solid
 from finqd.plugins.geometry_fin_ray import FinRay
 from finqd.plugins.mesher_swept import Swept
 from finqd.plugins.mesher_tetrahedral import Tetrahedral
-from finqd.plugins.swept_patches import edge_counts
+from finqd.plugins.swept_patches import edge_counts, graded
 from finqd.solid import Prism, Solid, SurfaceSolid
 from finqd.units import DEG, MM
 
@@ -155,6 +155,52 @@ def test_second_order_hexahedra_have_straight_edges_and_the_same_regions() -> No
     paved = replace(solid, patches=None)
     with pytest.raises(MeshError, match="triangles, and there are no quadratic wedges"):
         Swept(order=2).mesh(paved)
+
+
+def test_grading_shrinks_the_edges_at_notches_and_leaves_the_rest_as_it_was() -> None:
+    solid = FinRay().build(BENCHMARK)
+    even, fine = Swept(size_mm=3.0, order=2, layers=2).mesh(solid), Swept(size_mm=3.0, order=2, layers=2, grading=4.0)
+    mesh = fine.mesh(solid)
+    assert_good_mesh(mesh, solid, worst=0.02)
+    assert mesh.n_vertices == even.n_vertices
+    notches = np.concatenate(solid.holes)
+
+    def nearest(of: Mesh) -> float:
+        level = of.vertices[of.vertices[:, 2] == of.vertices[:, 2].min()][:, :2]
+        distances = np.linalg.norm(notches[:, None] - level[None], axis=2)
+        return float(np.median(np.sort(distances, axis=1)[:, 1]))  # the notch itself is a vertex
+
+    assert nearest(mesh) < 0.4 * nearest(even)
+    assert np.array_equal(graded(5, 1.0), np.linspace(0.0, 1.0, 6))
+    shares = graded(5, 3.0)
+    assert np.allclose(shares + shares[::-1], 1.0) and np.all(np.diff(shares) > 0.0)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_bricks_cut_into_tetrahedra_still_fit_together(order: int) -> None:
+    for finger in (BENCHMARK, *sobol_fingers(1, seed=3)):
+        solid = FinRay().build(finger)
+        whole, mesh = Swept(size_mm=6.0).mesh(solid), Swept(size_mm=6.0, order=order, tetrahedra=True).mesh(solid)
+        assert_good_mesh(mesh, solid, worst=0.0)
+        (count,) = {kind: len(nodes) for kind, nodes in mesh.blocks.items()}.values()
+        assert count == 6 * len(whole.blocks["hex8"]) + 3 * len(whole.blocks.get("wedge6", ()))
+        # a face without its match inside would count as boundary
+        triangles = mesh.vertices[mesh.surface_triangles()]
+        sides = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        rings = (solid.outer, *solid.holes)
+        outline = sum(np.linalg.norm(ring - np.roll(ring, 1, axis=0), axis=1).sum() for ring in rings)
+        area = 2.0 * solid.area + outline * finger["thickness"]
+        assert 0.5 * np.linalg.norm(sides, axis=1).sum() == pytest.approx(area, rel=1e-9)
+        assert face_area(mesh, "contact") == pytest.approx(face_area(whole, "contact"), rel=1e-12)
+    paved = replace(FinRay().build(BENCHMARK), patches=None)
+    assert_good_mesh(Swept(tetrahedra=True).mesh(paved), paved, worst=0.0)
+
+
+def test_second_order_fingers_keep_their_patches() -> None:
+    mesher = Swept(size_mm=3.0, order=2, layers=2, grading=4.0)
+    for finger in sobol_fingers(4, seed=11):
+        mesh = mesher.mesh(FinRay().build(finger))
+        assert set(mesh.blocks) == {"hex20"} and mesh.quality().inverted == 0
 
 
 @pytest.mark.parametrize("contact_line", [None, TRAPEZOID.contact_line])

@@ -31,7 +31,8 @@ class Swept:
     shrink towards the notches between walls and ribs, with that exponent (patches only). A profile that comes in
     patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by interpolation, without
     wedges; any other by gmsh. ``order``: 2 gives quadratic hexahedra (hex20, straight edges, a node in the middle of
-    each); there is no quadratic wedge, so that a profile that leaves triangles is refused then.
+    each); there is no quadratic wedge, so that a profile that leaves triangles is refused then. ``tetrahedra``: each
+    hexahedron is cut into six, each wedge into three: another family of elements on the same nodes, to compare with.
     """
 
     size_mm: Annotated[float, Ge(0.2), Le(50)] = 4.0
@@ -39,6 +40,7 @@ class Swept:
     least_edges: Annotated[int, Ge(1), Le(10)] = 1
     order: Literal[1, 2] = 1
     grading: Annotated[float, Ge(1), Le(4)] = 1.0
+    tetrahedra: bool = False
 
     def mesh(self, solid: Solid) -> Mesh:
         """Return the mesh of ``solid``; raises ``MeshError`` (``finqd.contracts.Mesher``)."""
@@ -48,18 +50,22 @@ class Swept:
         worst = plane.worst()
         if worst <= 0:
             raise MeshError(f"the profile's best mesh has a turned element (sine of its corner {worst:.2g})")
-        if self.order == 2 and len(plane.triangles):
+        if self.tetrahedra:
+            plane = _cut(plane)
+        elif self.order == 2 and len(plane.triangles):
             raise MeshError(
-                f"the profile's mesh has {len(plane.triangles)} triangles, and there are no quadratic wedges: use order "
-                "1, another size_mm, or the mesher 'tetrahedral' with order 2"
+                f"the profile's mesh has {len(plane.triangles)} triangles, and there are no quadratic wedges: use "
+                "order 1, another size_mm, or the mesher 'tetrahedral' with order 2"
             )
         mesh = self._sweep(plane, solid.thickness)
+        if self.tetrahedra:
+            mesh = Mesh(mesh.vertices, {"tet4": _tetrahedra(mesh.blocks["wedge6"])})
         return with_finger_sets(quadratic(mesh) if self.order == 2 else mesh, solid.contact_line)
 
     def _plane(self, solid: Prism) -> PlaneMesh:
         patches = solid.patches or _single_patch(solid)
         first = self._from_patches(solid, patches) if patches else None
-        if first and first.worst() >= _GOOD_ENOUGH:
+        if first and (first.worst() >= _GOOD_ENOUGH or self.order == 2):  # paving leaves triangles: no quadratic wedges
             return first
         from finqd.plugins.swept_paving import pave
 
@@ -92,6 +98,33 @@ class Swept:
                 lower = elements[:, None, :] * (layers + 1) + np.arange(layers)[None, :, None]
                 blocks[kind] = np.concatenate([lower, lower + 1], axis=-1).reshape(-1, 2 * elements.shape[1])
         return Mesh(vertices.reshape(-1, 3), blocks)
+
+
+def _cut(plane: PlaneMesh) -> PlaneMesh:
+    """Return the mesh with every quadrilateral cut along its shorter diagonal."""
+    a, b, c, d = plane.quads.T
+    corners = plane.points[plane.quads]
+    one, other = (np.linalg.norm(corners[:, i] - corners[:, i + 2], axis=1) for i in (0, 1))
+    first = np.where((one <= other)[:, None], np.column_stack([a, b, c]), np.column_stack([b, c, d]))
+    second = np.where((one <= other)[:, None], np.column_stack([a, c, d]), np.column_stack([b, d, a]))
+    triangles = np.concatenate([first, second, plane.triangles])
+    return PlaneMesh(plane.points, np.empty((0, 4), dtype=int), triangles)
+
+
+def _tetrahedra(wedges: np.ndarray) -> np.ndarray:
+    """Return three tetrahedra (3 n, 4) a wedge (n, 6); faces of neighbours match, as the vertex with the smaller id
+    decides (Dompierre, Labbe, Vallet and Camarero, Proc. 8th Int. Meshing Roundtable, 1999).
+
+    Holds for `_sweep`'s numbering, in which all vertices of a column are numbered together, from below.
+    """
+    order = np.argsort(wedges[:, :3], axis=1)
+    low, high = (np.take_along_axis(half, order, axis=1) for half in (wedges[:, :3], wedges[:, 3:]))
+    rows = [[low[:, 0], low[:, 1], low[:, 2], high[:, 2]], [low[:, 0], low[:, 1], high[:, 2], high[:, 1]],
+            [low[:, 0], high[:, 0], high[:, 1], high[:, 2]]]
+    found = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    odd = np.linalg.det(np.eye(3)[order]) < 0.0  # the corners were swapped an odd number of times
+    found[odd] = found[odd][:, :, [1, 0, 2, 3]]
+    return found.reshape(-1, 4)
 
 
 def _single_patch(solid: Prism) -> tuple[Patch, ...] | None:
