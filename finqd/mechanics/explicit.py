@@ -14,7 +14,7 @@ from finqd.mechanics.rotation_kernels import rotation_matrix
 from finqd.mechanics.state import Direction, State, StepReport
 from finqd.mechanics.system import System
 
-GROUP = 8  # substeps after which friction is committed and the stable step looked up again
+GROUP = 8  # substeps after which the stable step is looked up again
 GAIN = 0.5  # energy out of nothing, as a share of kinetic and stored energy, that is a blow-up
 FLOOR_SPEED = 0.01  # [m/s] and the speed of everything that is too slow to call it one
 AHEAD = 2.0  # how much farther than those substeps go contact is looked for
@@ -78,7 +78,8 @@ class Motion:
     state: its velocities are those at the start of the step; velocities: zero where held, (n_vertices, 3) [m/s]
     rigid_velocities [m/s], momenta [kg m^2/s]: (n_rigid, 3)
     inverse_masses: 0 where held, (n_vertices, 3) [1/kg]; rigid_free: 1 or 0, (n_rigid, 1)
-    substep: length of the last one [s]; potential: energy at ``state`` [J]; work: that the drives have done [J]
+    substep: length of the last one [s]; touching: whether any contact can come up in the next few
+    potential: energy at ``state`` [J]; work: that the drives have done [J]
     """
 
     def __init__(self, system: System, state: State, dt: float) -> None:
@@ -90,7 +91,7 @@ class Motion:
         self.rigid_free = np.where(system.rigid_held, 0.0, 1.0)[:, None]
         self.rigid_velocities = self.rigid_free * state.rigid_velocities
         self.momenta = self.rigid_free * state.angular_momenta
-        self.substep = dt
+        self.substep, self.touching = dt, True
         self.work, self.potential = 0.0, self._forces()
         self.start_energy = self.kinetic() + self.potential
 
@@ -122,6 +123,8 @@ class Motion:
             rigid_rotations=rotations, rigid_velocities=old.rigid_velocities, angular_momenta=old.angular_momenta,
             progress=old.progress,
         )
+        if self.touching:
+            self.system.contact.relag(self.state)  # bounds from before, out of phase with a vibration, would feed it
         self.potential = self._forces()
         if len(ids):
             self.work += 0.5 * float(np.vdot(pushed + d.soft[ids], positions[ids] - old.positions[ids]))
@@ -243,8 +246,8 @@ def elastic_rate(system: System, state: State) -> float:
 def substeps(motion: Motion, method: Method, options: SubstepOptions) -> tuple[State, StepReport]:
     """Return the end of the step, or its start and the reason, by as many substeps as it takes.
 
-    Coulomb's history is committed every few substeps, and by then checked for sanity, since it cannot be taken back: a
-    step that is tried again starts with elastic slips from within the failed one, which are below a micrometre.
+    Friction is renewed and committed in every substep in which something can touch. That cannot be taken back: a step
+    that is tried again starts with elastic slips from within the failed one, which are below a micrometre.
     """
     system, report, dt = motion.system, StepReport(), motion.dt
     done = 0.0  # share of the step
@@ -255,15 +258,16 @@ def substeps(motion: Motion, method: Method, options: SubstepOptions) -> tuple[S
             return motion.start, report
         h = (1.0 - done) / count
         for _ in range(min(GROUP, count)):
+            if report.substeps and motion.touching:
+                system.contact.commit(motion.state)
+                system.contact.begin_step(motion.state)
             done = min(done + h, 1.0)
             method.advance(motion, h * dt, motion.start.time + done * dt)
             report.substeps += 1
         report.reason = motion.trouble()
         if report.reason:
             return motion.start, report
-        system.contact.commit(motion.state)
-        if done < 1.0 - 1e-12:
-            system.contact.begin_step(motion.state)
+    system.contact.commit(motion.state)
     report.converged = True
     return motion.finished(), report
 
@@ -276,7 +280,7 @@ def _count(motion: Motion, method: Method, options: SubstepOptions, left: float)
     """
     system, dt = motion.system, motion.dt
     now = contact_rate(system, motion.state)
-    longest, count = min(left * dt, 2.0 * motion.substep), 1
+    longest, count, ahead = min(left * dt, 2.0 * motion.substep), 1, now
     for _ in range(LOOKS):
         count = max(math.ceil(left * dt / longest * (1 - 1e-9)), 1)
         if method.binary:  # 1/left is a power of two over a whole number
@@ -295,5 +299,5 @@ def _count(motion: Motion, method: Method, options: SubstepOptions, left: float)
         if h <= stable * (1 + 1e-9) and reach >= 1.0:
             break
         longest = min(max(stable, 0.5 * h), h if reach >= 1.0 else 0.5 * h)
-    motion.substep = left * dt / count
+    motion.substep, motion.touching = left * dt / count, max(now, ahead) > 0.0
     return count
