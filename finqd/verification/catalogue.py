@@ -61,7 +61,7 @@ def _rotation(fast: bool) -> Iterator[Case]:
 
 
 #: element -> bricks a side
-COOK_MESHES = {"hex8": 64, "hex20": 48, "tet10": 48, "wedge6": 48, "tet4": 48}
+COOK_MESHES = {"hex8": 64, "hex20": 48, "tet10": 64, "wedge6": 48, "tet4": 48}
 COOK_FAST = {"hex8": 16, "hex20": 8, "tet10": 8, "wedge6": 16, "tet4": 16}
 LOCKED = (0.5 * (8.7 + 11.8) * MM, 0.5 * (11.8 - 8.7) * MM)
 
