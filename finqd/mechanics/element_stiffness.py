@@ -114,10 +114,10 @@ def _rest_chunk(
 def consistent_gradients(kind: Element, vertices: np.ndarray, *, start: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return dN_a/dX (n, q, k, 3) [1/m] and weights (n, q) [m^3] of the stiffness rule, right in their mean.
 
-    The patch test asks for sum_q w_q dN_a/dX(q) = int dN_a/dX dV. A quadratic element's rule is exact there with straight
-    edges, not with curved ones; then the gradients are shifted, all points alike, by what their mean lacks, and the
-    weights scaled to the exact volume. Uniform strains stay exact, as sum_a X_a dN_a/dX has the exact mean at every
-    point already.
+    The patch test asks for sum_q w_q dN_a/dX(q) = int dN_a/dX dV. A quadratic element's rule is exact there with
+    straight edges, not with curved ones; then the gradients are shifted, all points alike, by what their mean lacks,
+    and the weights scaled to the exact volume. Uniform strains stay exact, as sum_a X_a dN_a/dX has the exact mean at
+    every point already.
     Source: Krongauz and Belytschko, Int. J. Numer. Methods Eng. 40 (1997) 4215 (corrected derivatives); the exact means
     come from a rule of degree 5 (hex20) or 3 (tet10), which is enough for curved edges too.
     ``start``: number of the first element. Raises MeshError for an inverted one.

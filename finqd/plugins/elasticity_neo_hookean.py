@@ -29,8 +29,11 @@ class NeoHookean:
 
     W = mu/2 (J^(-2/3) tr F^T F - 3) + kappa/4 (J^2 - 1 - 2 ln J) with mu and kappa = lambda + 2 mu/3 of the material;
     in the limit of small strains every element is exactly that of ``corotated``. hex8 bends and stays isochoric by nine
-    inner modes, wedge6 by three and a mean dilatation, hex20 by its reduced rule, tet10 by four points;
-    tet4 has no remedy and locks. An inverted element costs infinite energy.
+    inner modes, hex20 by its reduced rule, tet10 by four points. wedge6 (three modes, a mean dilatation) bends along
+    its axis, but locks in the plane of its triangles near nu = 0.5; tet4 has no remedy and locks. An inverted
+    element costs infinite energy. Limit: enhanced modes fold into hourglasses in strong compression; hex8 is stable to
+    65 % of its height under uniform pressure, and between bonded plates gets too soft before that (4 % at 80 %, 13 % at
+    70 %). hex20 and tet10 go on to 55 %.
     """
 
     def potential(self, mesh: Mesh, material: Material, *, first_vertex: int = 0) -> NeoHookeanPotential:
