@@ -103,6 +103,8 @@ class Newton:
             report.iterations += 1
             moved = self._iterate(trial, energy)
             if moved is None:
+                if best is None and report.residual <= options.tolerance_N:  # at rest already, to the last digit
+                    best, best_jump, report.reason = trial, report.residual, ""
                 break
             trial = moved
             energy = increment.gradient(trial)
