@@ -197,7 +197,8 @@ def angular_loss(name: str, dt: float) -> float:
     bar.velocities += np.cross((3.0, 0.0, 10.0), mesh.vertices - mesh.vertices.mean(axis=0))
     system, states = run(scene, made(name), [dt] * round(0.1 / dt))
     momenta = [system.masses[:, None] * s.velocities for s in states]
-    assert np.abs(np.sum(momenta, axis=1) - momenta[0].sum(axis=0)).max() < 1e-7 * np.linalg.norm(momenta[0].sum(axis=0))
+    whole = np.sum(momenta, axis=1)
+    assert np.abs(whole - whole[0]).max() < 1e-7 * np.linalg.norm(whole[0])
     spins = [np.cross(s.positions, p).sum(axis=0) for s, p in zip(states, momenta, strict=True)]
     return float(np.linalg.norm(spins[-1] - spins[0]) / np.linalg.norm(spins[0]))
 
@@ -433,72 +434,6 @@ def test_substeps_are_counted_and_a_step_without_contact_is_one_to_imex(name: st
         assert found.counters["substeps"] == 3
     else:
         assert found.counters["substeps"] < 1.5 * least / 0.8
-
-
-# -- steps chosen by their error ---------------------------------------------------------------------------------------
-
-
-def swing(stepper: Any, time_step: float) -> tuple[float, Trajectory]:
-    """Return where the tip of a soft beam is 0.1 s after it is let go [m], and the trajectory."""
-    scene = Scene(gravity=(0.0, 0.0, -GRAVITY))
-    rod = scene.add_soft(
-        box_mesh((0.08, 0.01, 0.01), (8, 1, 1)), Material(youngs_modulus=3e5, poisson_ratio=0.3, density=1000.0)
-    )
-    rod.fix("xmin")
-    found = checked(simulate(scene, duration=0.1, time_step=time_step, stepper=stepper, record=True))
-    return float(found.soft_positions[-1, rod.vertices("xmax"), 2].mean()), found
-
-
-@lru_cache
-def swung() -> float:
-    return swing(made("bdf2"), 5e-5)[0]
-
-
-@pytest.mark.parametrize(("name", "tolerances"), [("implicit_euler", (0.1, 0.01)), ("bdf2", (0.1, 0.005))])
-def test_the_error_follows_the_tolerance(name: str, tolerances: tuple[float, float]) -> None:
-    errors, steps = [], []
-    for tolerance in tolerances:
-        tip, found = swing(made(name, error_tolerance_mm=tolerance), 0.05)
-        errors.append(abs(tip - swung()))
-        steps.append(found.counters["steps"])
-        assert found.counters["error_overruns"] == 0
-        assert np.allclose(found.times, [0.0, 0.05, 0.1])
-    order = 1 if name == "implicit_euler" else 2
-    ratio = tolerances[0] / tolerances[1]
-    # global error and steps of order p go with tolerance^(p/(p+1)) and tolerance^(-1/(p+1))
-    assert math.log(errors[0] / errors[1]) / math.log(ratio) == pytest.approx(order / (order + 1), abs=0.25)
-    assert math.log(steps[1] / steps[0]) / math.log(ratio) == pytest.approx(1 / (order + 1), abs=0.15)
-
-
-def test_steps_shorten_where_something_hits_and_lengthen_after() -> None:
-    scene = Scene(gravity=(0.0, 0.0, -GRAVITY))
-    cube = scene.add_soft(box_mesh((0.03, 0.03, 0.03), (2, 2, 2)), RUBBER)
-    cube.start_positions[:, 2] += 0.02
-    scene.add_plane()
-    impact, times = math.sqrt(2 * 0.02 / GRAVITY), [0.0]
-    stepper = registry.create("stepper", {"name": "bdf2", "error_tolerance_mm": 0.05})
-    found = checked(
-        simulate(
-            scene, duration=0.4, time_step=0.05, stepper=stepper, watch=lambda system, state: times.append(state.time)
-        )
-    )
-    steps, middles = np.diff(times), 0.5 * (np.array(times[1:]) + np.array(times[:-1]))
-    around = np.abs(middles - impact) < 0.005
-    before = (middles < impact - 0.02) & (middles > 0.01)
-    assert steps[around].min() < 0.2 * steps[before].max()
-    assert steps[-1] > 5 * steps[around].min()
-    assert found.counters["error_rejections"] > 0
-    assert found.counters["rejected_steps"] >= found.counters["error_rejections"]
-    assert found.contact_forces[-1, 0] == pytest.approx(0.027 * GRAVITY, rel=0.01)
-
-
-def test_an_error_that_no_step_meets_does_not_end_the_run() -> None:
-    scene = Scene(gravity=(0.0, 0.0, -GRAVITY))
-    scene.add_rigid(load_object("cube"), position=(0.0, 0.0, 1.0))
-    stepper = registry.create("stepper", {"name": "implicit_euler", "error_tolerance_mm": 1e-9})
-    found = checked(simulate(scene, duration=0.02, time_step=0.02, stepper=stepper))
-    assert found.counters["steps"] == 256
-    assert found.counters["error_overruns"] == 256
 
 
 def test_options_out_of_range_are_refused() -> None:
