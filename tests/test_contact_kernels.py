@@ -305,3 +305,33 @@ def test_diagonal_and_largest_force() -> None:
     size, where = largest_force(forces, fixed)
     assert np.isnan(size) and where == 3
     assert largest_force(np.zeros((0, 3)), np.zeros((0, 3), dtype=bool))[1] == -1
+
+
+# -- dents -------------------------------------------------------------------------------------------------------------
+
+
+def planes_in_a_dent(rise: float, kept: np.ndarray) -> int:
+    """Return how many planes a point gets just over a strip of two triangles, the other of which rises by ``rise`` [m].
+
+    ``kept`` remembers which pairs have had a plane.
+    """
+    mm = 1e-3
+    positions = np.array([(0, 0, 0), (mm, 0, 0), (mm, mm, 0), (0.3 * mm, 1.5 * mm, rise)])
+    faces = np.array([(0, 1, 2), (0, 2, 3)])
+    room = 8
+    return kernels.pair_features(
+        positions, faces, np.arange(2), np.tile(np.eye(3), (2, 1, 1)), np.array([(0, 0), (0, 1)]),
+        np.array([(0.55 * mm, 0.5 * mm, 1e-6)]), np.array([(0.0, 0.0, -1.0)]), np.zeros(3), np.eye(3), mm, mm, mm, kept,
+        np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64), np.empty((room, 3)), np.empty((room, 3)),
+        np.empty(room),
+    )
+
+
+def test_the_side_of_a_shallow_dent_stays_for_the_step_it_came_in() -> None:
+    threshold = 3.0 * kernels.RISE * 1e-3  # the triangle's middle rises by a third
+    fresh = np.zeros(2, dtype=bool)
+    assert planes_in_a_dent(0.9 * threshold, fresh) == 1 and fresh.tolist() == [True, False]
+    assert planes_in_a_dent(1.1 * threshold, fresh) == 2 and fresh.all()
+    assert planes_in_a_dent(0.9 * threshold, fresh) == 2  # it came in, and has not clearly fallen away
+    assert planes_in_a_dent(-0.9 * threshold, fresh) == 2
+    assert planes_in_a_dent(-1.1 * threshold, fresh) == 1

@@ -17,6 +17,7 @@ from numba import njit
 
 from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, signed_distance
 
+KEEP = 1.25  # a dent's side that has had a plane in this step keeps it up to this multiple of the distance
 RISE = 0.01  # slope over the first plane from which a neighbouring triangle makes a dent
 OPPOSED, FULLY_OPPOSED = 0.05, 0.35  # cosines between which two surfaces that look at each other come to push fully
 
@@ -361,15 +362,18 @@ def _nearest_triangle(p, positions, faces, triangle_face, triangle_weight, pairs
 @njit(cache=True)
 def pair_features(
     positions, faces, triangle_face, triangle_weight, pairs, points, outward, centre, rotation, depth, reach, near,
-    out_point, out_face, out_weight, out_normal, out_share,
+    kept, out_point, out_face, out_weight, out_normal, out_share,
 ):
     """Write the planes that the features of a rigid body meet on a soft body; return how many.
 
-    pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); outward: unit pseudonormals of
+    pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); kept: bool, shape (n,), the pairs
+    that had a plane earlier in this step, to which those that get one now are added; outward: unit pseudonormals of
     the features, body frame, shape (n_points, 3). Each point within ``reach`` [m] outside and ``depth`` inside (deeper
     ones are nearer to the wall's other side) gets the plane of the nearest triangle, or, outside beyond a convex
     edge, the plane across the direction of the distance. In a dent it gets the planes of the other triangles within
     ``near`` [m] as well, as far as they rise over the first: it cannot be in balance on one side of a crease alone.
+    A pair that is kept loses its plane only where the triangle clearly falls away: in a shallow dent the sides would
+    come and go with each renewal, and no step however short would end.
     """
     p, bary, n, other = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     corner, distance = np.empty((3, 3)), np.empty(pairs.shape[0])
@@ -397,6 +401,7 @@ def pair_features(
         for i in range(3):
             for j in range(3):
                 facing_out -= n[i] * rotation[i, j] * outward[q, j]
+        kept[nearest] = True
         _write_plane(
             count, q, pairs[nearest, 1], bary, n, triangle_face, triangle_weight, out_point, out_face, out_weight,
             out_normal,
@@ -404,12 +409,13 @@ def pair_features(
         out_share[count] = opposition(facing_out)
         count += 1
         for c in range(first, last):
-            if c == nearest or distance[c] > near or count >= out_point.shape[0]:
+            if c == nearest or distance[c] > (KEEP if kept[c] else 1.0) * near or count >= out_point.shape[0]:
                 continue
             _triangle(positions, faces, triangle_face, triangle_weight, pairs[c, 1], corner, other)
             middle = (corner[0] + corner[1] + corner[2]) / 3.0
-            if np.dot(n, other) < 0.5 or np.dot(n, middle - foot) <= RISE * near:
+            if np.dot(n, other) < 0.5 or np.dot(n, middle - foot) <= (-RISE if kept[c] else RISE) * near:
                 continue
+            kept[c] = True
             closest_on_triangle(p, corner[0], corner[1], corner[2], bary)
             _write_plane(
                 count, q, pairs[c, 1], bary, other, triangle_face, triangle_weight, out_point, out_face, out_weight,

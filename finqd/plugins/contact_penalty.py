@@ -95,6 +95,7 @@ class PenaltyContact:
         self.start: State | None = None
         self.last_rows_state: State | None = None
         self._pairs: list[np.ndarray] = []
+        self._kept: list[list[np.ndarray]] = []
         self._pairs_state: State | None = None
 
     def _lay_out_keys(self) -> None:
@@ -133,6 +134,7 @@ class PenaltyContact:
         self.start = state
         # how far contacts look at each other is fixed for a step: a dent turns them, and they would flicker
         self.fresh_shares = np.full(self.n_keys, np.nan)
+        self._forget_dents()
         kernels.face_normals(state.positions, self.surface.faces, self.surface.face_corners, self.facing)
         self.relag(state)
 
@@ -336,7 +338,7 @@ class PenaltyContact:
             shape.feature_points,
             self.feature_normals[r], np.ascontiguousarray(state.rigid_positions[r]),
             np.ascontiguousarray(state.rigid_rotations[r]), FEATURE_DEPTH, FEATURE_MARGIN, FEATURE_NEAR,
-            point, face, weight, normal, share,
+            self._kept[r][body], point, face, weight, normal, share,
         )
         point, share = point[:count], share[:count]
         key = self.first_key["feature", r, body] + point
@@ -360,6 +362,11 @@ class PenaltyContact:
                 return
         self._pairs = [self._feature_pairs(r, state) for r in range(len(self.scene.rigid_bodies))]
         self._pairs_state = state
+        self._forget_dents()
+
+    def _forget_dents(self) -> None:
+        """Start anew with which (feature, triangle) pairs have had a plane in this step."""
+        self._kept = [[np.zeros(len(pairs), dtype=bool) for pairs in bodies] for bodies in self._pairs]
 
     def _feature_pairs(self, r: int, state: State) -> list[np.ndarray]:
         """Return for each soft body the (feature, triangle) pairs within reach of rigid body ``r``, sorted."""
