@@ -223,7 +223,7 @@ class Scene:
         velocity: Sequence[float] = (0.0, 0.0, 0.0), angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
         force: Sequence[float] = (0.0, 0.0, 0.0), name: str = "", held: bool = False,
     ) -> RigidBody:
-        """Add a rigid body with its centre of mass at ``position`` [m]; ``held``: it stays there, whatever pushes it."""
+        """Add a rigid body with its centre of mass at ``position`` [m]; ``held``: it stays there, come what may."""
         body = RigidBody(
             name=self._new_name(name or shape.name), shape=shape, position=np.asarray(position, dtype=float),
             rotation=np.eye(3) if rotation is None else np.asarray(rotation, dtype=float),

@@ -366,8 +366,8 @@ def pair_features(
 ):
     """Write the planes that the features of a rigid body meet on a soft body; return how many.
 
-    pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); kept: bool, shape (n,), the pairs
-    that had a plane earlier in this step, to which those that get one now are added; outward: unit pseudonormals of
+    pairs: candidate (point, triangle) of one soft body, sorted by point, shape (n, 2); kept: bool, shape (n,), those
+    that had a plane earlier in this step, to which are added those that get one now; outward: unit pseudonormals of
     the features, body frame, shape (n_points, 3). Each point within ``reach`` [m] outside and ``depth`` inside (deeper
     ones are nearer to the wall's other side) gets the plane of the nearest triangle, or, outside beyond a convex
     edge, the plane across the direction of the distance. In a dent it gets the planes of the other triangles within
