@@ -1,4 +1,4 @@
-"""What errors are measured against: the finest rungs of two element families, which must agree.
+"""What errors are measured against: the finest rung of one element family, which that of another has to confirm.
 
 A reference that ships with finqd is a file ``studies/reference_*.json``; the same file is what a study leaves in its
 folder, so anybody can repeat it, compare, and put another one there.
@@ -26,7 +26,8 @@ AGREEMENT_PERCENT = 1.0  # two families that differ by more are no agreement
 class Reference:
     """Converged values of a case, and where they come from.
 
-    physics: hash of what the values depend on (`finqd.accuracy.Study.physics`); values: key -> mean of the families
+    physics: hash of what the values depend on (`finqd.accuracy.Study.physics`)
+    values: key -> value, of the first family that worked
     families: what each gave: rung, options, status, values, seconds, dofs, steps
     difference_percent: between the families in the case's quantity, None if only one is there
     source: "computed" by this study, or "shipped", or a file's name
@@ -62,7 +63,8 @@ class Reference:
             return f"reference by {names} alone ({failed}): nothing says how far off it is"
         differ = f"{names} differ by {self.difference_percent:.2g} %"
         floor = f"errors below {self.uncertainty_percent:.2g} % are not resolved"
-        verdict = "the reference is their mean" if self.agrees else "that is NO agreement; the reference is their mean"
+        first = next(str(family["rung"]) for family in self.families if family["status"] == "ok")
+        verdict = f"the reference is {first}" if self.agrees else f"that is NO agreement; the reference is {first}"
         return f"{differ}: {verdict}, and {floor}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -73,7 +75,7 @@ class Reference:
 def make_reference(
     case: Case, physics: str, rows: Sequence[Mapping[str, Any] | None], *, full: bool
 ) -> Reference | None:
-    """Return the reference of rows of two families, by the mean of those that worked; None if none did."""
+    """Return the first of two families that worked, compared with the other; None if none did."""
     done = [row for row in rows if row is not None and row["status"] == "ok"]
     if not done:
         return None
@@ -83,7 +85,7 @@ def make_reference(
         if found and isinstance(found[0], bool):
             values.update({key: found[0]} if len(set(found)) == 1 else {})  # no verdict where the families disagree
         elif found:
-            values[key] = sum(found) / len(found)
+            values[key] = found[0]
     main = [row["values"][case.main] for row in done if case.main in row["values"]]
     if not main:
         return None

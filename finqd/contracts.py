@@ -110,7 +110,11 @@ class ElasticPotential(Protocol):
 
 
 class Elasticity(Protocol):
-    """Element formulation and constitutive law."""
+    """Element formulation and constitutive law.
+
+    A class may declare ``small_rotation: ClassVar[bool] = True``: turning a body far costs energy. Any plugin of the
+    kinds elasticity, stepper and contact may have ``effects``, effect -> on or off and why, which a result then says.
+    """
 
     def potential(self, mesh: Mesh, material: Material, *, first_vertex: int = 0) -> ElasticPotential:
         """Return the potential of a body whose vertex 0 is vertex ``first_vertex`` of the scene."""
@@ -167,7 +171,10 @@ class Contact(Protocol):
 
 
 class Stepper(Protocol):
-    """One step in time."""
+    """One step in time.
+
+    A class may declare ``inertia: ClassVar[bool] = False``: soft bodies have none. Then they need not fall freely.
+    """
 
     def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:
         """Return the state ``dt`` [s] later and a report; a step that fails says so there and returns ``state``."""
