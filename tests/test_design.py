@@ -318,7 +318,7 @@ def test_settings_are_parsed_as_json_or_text():
 
 def test_presets_set_what_is_open_and_nothing_else(benchmark):
     fine = apply_preset(benchmark, "fine")
-    assert (fine.plugin("mesher").size_mm, fine.protocol.time_step_ms) == (1.4, 5.0)
+    assert (fine.plugin("mesher").size_mm, fine.protocol.time_step_ms) == (2.0, 5.0)
     explicit = benchmark.with_overrides({"mesher.size_mm": 3, "mesher.layers": 4, "protocol.time_step_ms": 7})
     assert apply_preset(explicit, "draft").digest() == explicit.digest()
     other = apply_preset(benchmark.with_overrides({"mesher": "tetrahedral"}), "draft")

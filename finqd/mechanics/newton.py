@@ -17,6 +17,7 @@ ARMIJO = 1e-4  # share of the linear decrease that a step must reach (Nocedal an
 LAG_FORCE = 0.1  # [N] what renewed contact may leave unbalanced at the end of a step,
 LAG_SHARE = 0.1  # or this share of the largest normal force on a body
 LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
+PATIENCE = 4  # times as many renewals are granted before what they leave makes the step fail
 EARLY = 100.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
@@ -93,7 +94,9 @@ class Newton:
                     best, best_jump = trial, report.residual
                 steady = change <= options.friction_tolerance and report.residual <= LAG_FORCE
                 still = report.residual <= options.tolerance_N or steady
-                if done and (still or not progress or report.friction_updates > options.max_friction_updates):
+                tired = not progress or report.friction_updates > options.max_friction_updates
+                lasting = report.friction_updates > PATIENCE * options.max_friction_updates
+                if done and (still or (tired and (lasting or best_jump <= self._bound()))):
                     break
                 continue
             if report.iterations >= options.max_iterations * (1 + report.friction_updates):
@@ -117,13 +120,16 @@ class Newton:
         Contact geometry can jump between two faces of a dent for ever, and friction bounds lag; what is left then must
         be small beside the contact forces, else the step was too long.
         """
-        system, report = self.system, self.report
-        system.contact.relag(best)
-        bound = max(LAG_FORCE, LAG_SHARE * float(np.max(system.contact.relagged_forces, initial=0.0)))
-        report.converged, report.residual = jump <= bound, jump
+        report = self.report
+        self.system.contact.relag(best)
+        report.converged, report.residual = jump <= self._bound(), jump
         if not report.converged:
             report.reason = f"contact moved on too fast: {jump:.3g} N left on {report.where}"
         return best
+
+    def _bound(self) -> float:
+        """Return what renewed contact may leave unbalanced at the end of a step [N]."""
+        return max(LAG_FORCE, LAG_SHARE * float(np.max(self.system.contact.relagged_forces, initial=0.0)))
 
     def _iterate(self, trial: State, energy: float) -> State | None:
         """Do one Newton iteration; None if no direction leads downhill."""
