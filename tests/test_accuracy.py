@@ -56,7 +56,7 @@ def fake_press(design, options, limit, progress):
         return measured(status="diverged", reason="no equilibrium <here> & now", seconds=1.0, dofs=99)
     through = size / getattr(mesher, "least_edges", 1)  # what the reference refines by
     error = LOCKED.get((name, order), 0.005) * through**2 + 2e-4 * step
-    seconds = {1: 10.0, 2: 60.0}[order] / size**2 * 10.0 / step
+    seconds = {1: 10.0, 2: 60.0}[order] / through**2 * 10.0 / step
     values = {"force_N": EXACT * (1 + error), "half_force_N": 2.0 * (1 + error), "energy_mJ": 30.0 * (1 + error)}
     return measured(
         status="ok", reason="", values=values, seconds=seconds, dofs=int(9000 / size), steps=int(600 / step),
