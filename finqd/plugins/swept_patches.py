@@ -147,6 +147,7 @@ class _Builder:
     """Collects nodes and quadrilaterals, patch by patch."""
 
     def __init__(self, points: np.ndarray, pairs: np.ndarray, counts: np.ndarray, grading: float) -> None:
+        self.graded = grading != 1.0
         self.points = [np.asarray(points)]
         self.n_points = len(points)
         self.quads: list[np.ndarray] = []
@@ -180,7 +181,8 @@ class _Builder:
     def _grid(self, bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndarray) -> None:
         """Fill a four-sided patch, its sides' node ids in counter-clockwise order."""
         points = self._all()
-        inner = _coons(*(points[side] for side in (bottom, right, top, left)))[1:-1, 1:-1]
+        sides = [points[side] for side in (bottom, right, top, left)]
+        inner = _coons(*sides, by_length=self.graded)[1:-1, 1:-1]
         ids = np.empty((len(right), len(bottom)), dtype=int)
         ids[0], ids[-1], ids[:, 0], ids[:, -1] = bottom, top[::-1], left[::-1], right
         ids[1:-1, 1:-1] = self._add(inner.reshape(-1, 2)).reshape(inner.shape[:2])
@@ -190,7 +192,7 @@ class _Builder:
         """Fill a three-sided patch by three grids that meet in a point inside it."""
         points = self._all()
         first, spokes = _halves([len(side) - 1 for side in sides])
-        centre = _centre([points[side] for side in sides], first, spokes)
+        centre = _centre([points[side] for side in sides], first, spokes, by_length=self.graded)
         hub = self._add(centre[None])
         arms = []
         for side, k, edges in zip(sides, first, spokes, strict=True):
@@ -210,14 +212,20 @@ def _between(start: np.ndarray, end: np.ndarray, edges: int) -> np.ndarray:
     return start + np.linspace(0.0, 1.0, edges + 1)[:, None] * (end[..., None, :] - start)
 
 
-def _coons(bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndarray) -> np.ndarray:
+def _coons(
+    bottom: np.ndarray, right: np.ndarray, top: np.ndarray, left: np.ndarray, *, by_length: bool = False
+) -> np.ndarray:
     """Return the points (..., rows, columns, 2) between four sides, counter-clockwise (discrete Coons patch).
 
-    Opposite sides are blended by the arc length along the other two, so that graded sides do not skew the inside.
+    by_length: opposite sides are blended by the arc length along the other two instead of by number, so that graded
+    sides do not skew the inside.
     """
     top, left = top[..., ::-1, :], left[..., ::-1, :]
-    u = 0.5 * (_arc_shares(bottom) + _arc_shares(top))[..., None, :, None]
-    v = 0.5 * (_arc_shares(left) + _arc_shares(right))[..., :, None, None]
+    u = np.linspace(0.0, 1.0, bottom.shape[-2])[None, :, None]
+    v = np.linspace(0.0, 1.0, left.shape[-2])[:, None, None]
+    if by_length:
+        u = 0.5 * (_arc_shares(bottom) + _arc_shares(top))[..., None, :, None]
+        v = 0.5 * (_arc_shares(left) + _arc_shares(right))[..., :, None, None]
     ruled = (1 - v) * bottom[..., None, :, :] + v * top[..., None, :, :]
     ruled = ruled + (1 - u) * left[..., :, None, :] + u * right[..., :, None, :]
     for side, end, weight in ((bottom, 0, 1 - u), (bottom, -1, u)):
@@ -245,7 +253,9 @@ def _halves(counts: Sequence[int]) -> tuple[list[int], list[int]]:
     return first, [counts[i - 1] - first[i - 1] for i in range(3)]
 
 
-def _centre(sides: Sequence[np.ndarray], first: Sequence[int], spokes: Sequence[int]) -> np.ndarray:
+def _centre(
+    sides: Sequence[np.ndarray], first: Sequence[int], spokes: Sequence[int], *, by_length: bool
+) -> np.ndarray:
     """Return where the three grids of a triangle should meet: the best worst corner among many points tried."""
     corners = np.array([side[0] for side in sides])
     middle = np.array([side[k] for side, k in zip(sides, first, strict=True)])
@@ -256,6 +266,6 @@ def _centre(sides: Sequence[np.ndarray], first: Sequence[int], spokes: Sequence[
     worst = np.full(len(hubs), np.inf)
     for i in range(3):
         start, end = sides[i][: first[i] + 1], sides[i - 1][first[i - 1] :]
-        grid = _coons(start, arms[i], arms[i - 1][:, ::-1], end)
+        grid = _coons(start, arms[i], arms[i - 1][:, ::-1], end, by_length=by_length)
         worst = np.minimum(worst, corner_sines(_cells(np.moveaxis(grid, 0, 2)).swapaxes(2, 3)).min(axis=(0, 1, 3)))
     return hubs[int(np.argmax(worst))]
