@@ -223,7 +223,12 @@ class Scene:
         velocity: Sequence[float] = (0.0, 0.0, 0.0), angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
         force: Sequence[float] = (0.0, 0.0, 0.0), name: str = "", held: bool = False,
     ) -> RigidBody:
-        """Add a rigid body with its centre of mass at ``position`` [m]; ``held``: it stays there, come what may."""
+        """Add a rigid body with its centre of mass at ``position`` [m]; ``held``: it stays there, come what may.
+
+        Raises InputError for a held body that has a velocity.
+        """
+        if held and (np.any(np.asarray(velocity)) or np.any(np.asarray(angular_velocity))):
+            raise InputError("a rigid body that is held must not have a velocity", name or shape.name)
         body = RigidBody(
             name=self._new_name(name or shape.name), shape=shape, position=np.asarray(position, dtype=float),
             rotation=np.eye(3) if rotation is None else np.asarray(rotation, dtype=float),

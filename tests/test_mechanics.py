@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from finqd.errors import InputError
+from finqd.mechanics.state import State
+from finqd.mechanics.system import System
 from finqd.mesh_shapes import box_mesh
 from finqd.objects import load_object
 from finqd.plugins.stepper_implicit_euler import ImplicitEuler
@@ -199,3 +201,27 @@ def test_where_nothing_happens_time_passes(what: str) -> None:
     assert found.status == "ok"
     assert np.allclose(found.times, [0.0, 0.01, 0.02, 0.03])
     assert np.allclose(found.soft_positions[-1], found.soft_positions[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("stepper", ["implicit_euler", "bdf2", "quasi_static"])
+def test_a_held_body_stays_and_bears_what_is_pressed_on_it(stepper: str) -> None:
+    ball = load_object("sphere")
+    scene = Scene(gravity=(0.0, 0.0, 0.0), friction=0.0)
+    scene.add_rigid(ball, position=(0.0, 0.0, -ball.ball_radius), held=True)
+    place = np.eye(4)
+    place[:3, 3] = (-0.01, -0.01, 0.0)
+    block = scene.add_soft(box_mesh((0.02, 0.02, 0.01), (4, 4, 2)).transformed(place), RUBBER)
+    block.drive("zmax", Motion(path=Shift(vector=(0.0, 0.0, -1e-3)), duration=0.2))
+    forces = []
+
+    def watch(system: System, state: State) -> None:
+        forces.append(system.contact_forces_on_rigid(state)[0])
+
+    found = simulate(scene, duration=0.4, time_step=0.02, stepper=stepper, watch=watch)
+    assert found.status == "ok", found.reason
+    assert np.array_equal(found.rigid_positions, np.tile(found.rigid_positions[0], (len(found.times), 1, 1)))
+    force = forces[-1]
+    assert force[2] < -0.1 and np.abs(force[:2]).max() < 1e-3 * -force[2]  # pushed down, by a symmetric block
+    assert found.contact_forces[-1, 0] >= -force[2]  # normal forces fan out around a ball: their sum is larger
+    with pytest.raises(InputError, match="sphere 2: a rigid body that is held must not have a velocity"):
+        scene.add_rigid(ball, position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 1.0), name="sphere 2", held=True)

@@ -194,11 +194,12 @@ class Increment:
 
     def finished(self, trial: State) -> State:
         """Return ``trial`` as the end of the step, with its velocities and the start as its ``previous``."""
-        past = self.past
+        past, held = self.past, self.system.rigid_held[:, None]
         return replace(
             trial, time=self.time, progress=self.progress,
             velocities=(trial.positions - past.origin) / past.h,
-            rigid_velocities=(trial.rigid_positions - past.rigid_origin) / past.h,
+            # a held body must not inherit the rounding of its velocity
+            rigid_velocities=np.where(held, 0.0, (trial.rigid_positions - past.rigid_origin) / past.h),
             angular_momenta=self._momenta(self._turns(trial)),
             previous=replace(self.start, previous=None),
         )
