@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from finqd import cli
+
 # One evaluation is serial inside; two test processes on two cores must not fight over threads.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
@@ -115,3 +117,16 @@ def example_environment(tmp_path_factory: pytest.TempPathFactory, wheel_environm
     return make_environment(
         tmp_path_factory.mktemp("example") / "env", [source], shared=[wheel_environment.site_packages]
     )
+
+
+@pytest.fixture
+def run(capsys):
+    """Return a function that runs one command line and returns (exit code, stdout, stderr)."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            cli.main([str(argument) for argument in arguments])
+        said = capsys.readouterr()
+        return end.value.code, said.out, said.err
+
+    return run

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from finqd import cli
 from finqd.accuracy import (
     LOG,
     REFERENCE,
@@ -96,19 +95,6 @@ def study_in(design):
         return study
 
     return study_in
-
-
-@pytest.fixture
-def run(capsys):
-    """Return a function that runs one command line and returns (exit code, stdout, stderr)."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as end:
-            cli.main([str(argument) for argument in arguments])
-        said = capsys.readouterr()
-        return end.value.code, said.out, said.err
-
-    return run
 
 
 # -- the ladder ----------------------------------------------------------------------------------------------------

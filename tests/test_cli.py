@@ -68,19 +68,6 @@ def evaluated(monkeypatch):
     return fake
 
 
-@pytest.fixture
-def run(capsys):
-    """Return a function that runs one command line and returns (exit code, stdout, stderr)."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as end:
-            cli.main([str(argument) for argument in arguments])
-        said = capsys.readouterr()
-        return end.value.code, said.out, said.err
-
-    return run
-
-
 def test_help_names_every_command(run):
     code, out, _ = run("--help")
     assert code == 0
