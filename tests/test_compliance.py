@@ -41,6 +41,12 @@ def test_linear_tetrahedra_lock_as_much_as_they_should(profile):
     assert row.passed, row
 
 
+def test_nodes_at_a_quarter_follow_the_notches_where_nodes_in_the_middle_do_not():
+    quarter, middle = (benchmark.measure("isosceles", f"hex20 2.5 {kind}") for kind in ("quarter", "even"))
+    assert quarter.passed and quarter.dofs == middle.dofs
+    assert middle.compliance_mm / quarter.reference_mm < 0.94
+
+
 def test_the_load_does_not_depend_on_the_mesh():
     solid = benchmark.benchmark_finger("isosceles")
     along = solid.contact_line[1] - solid.contact_line[0]

@@ -14,9 +14,13 @@ import pytest
 from scipy.stats import qmc
 from test_geometry_fin_ray import BENCHMARK, sobol_fingers
 
-from finqd.errors import InputError, MeshError
+from finqd import registry
+from finqd.errors import InputError, MeshError, PluginError
 from finqd.mechanics.mass import lumped_masses
 from finqd.mesh import Mesh
+from finqd.mesh_notches import notch_vertices
+from finqd.mesh_reference import MID_EDGES
+from finqd.mesh_shapes import box_mesh
 from finqd.meshing import close_mesher, mesh_solid
 from finqd.plugins.geometry_fin_ray import FinRay
 from finqd.plugins.mesher_swept import Swept
@@ -174,6 +178,37 @@ def test_grading_shrinks_the_edges_at_notches_and_leaves_the_rest_as_it_was() ->
     assert np.array_equal(graded(5, 1.0), np.linspace(0.0, 1.0, 6))
     shares = graded(5, 3.0)
     assert np.allclose(shares + shares[::-1], 1.0) and np.all(np.diff(shares) > 0.0)
+
+
+def test_quarter_nodes_stand_at_the_notches_and_nowhere_else() -> None:
+    solid = FinRay().build(BENCHMARK)
+    options = {"size_mm": 4.0, "order": 2, "layers": 2}
+    middle, quarter = Swept(**options).mesh(solid), Swept(**options, notch_nodes="quarter").mesh(solid)
+    notch = notch_vertices(middle)
+    moved = np.flatnonzero(np.linalg.norm(quarter.vertices - middle.vertices, axis=1) > 1e-12)
+    sides, nodes = np.array(MID_EDGES["hex20"]), quarter.blocks["hex20"]
+    ends = {int(n[8 + k]): (int(n[a]), int(n[b])) for n in nodes for k, (a, b) in enumerate(sides)}
+    assert set(moved) == {mid for mid, (a, b) in ends.items() if notch[a] != notch[b]} and len(moved) > 100
+    for mid in moved:
+        tip, far = sorted(ends[mid], key=lambda vertex: not notch[vertex])
+        expected = 0.75 * quarter.vertices[tip] + 0.25 * quarter.vertices[far]
+        np.testing.assert_allclose(quarter.vertices[mid], expected, atol=1e-15)
+    assert quarter.volume == pytest.approx(middle.volume, rel=1e-13) and quarter.quality().inverted == 0
+    assert {name: len(ids) for name, ids in quarter.node_sets.items()} == {
+        name: len(ids) for name, ids in middle.node_sets.items()
+    }
+    with pytest.raises(PluginError, match="notch_nodes"):
+        registry.create("mesher", {"name": "swept", "notch_nodes": "third"})
+
+
+def test_notches_are_the_re_entrant_edges_of_the_boundary() -> None:
+    assert not notch_vertices(box_mesh((1.0, 1.0, 1.0), (2, 2, 2))).any()
+    brick = box_mesh((2.0, 2.0, 1.0), (2, 2, 2))
+    centres = brick.vertices[brick.blocks["hex8"]].mean(axis=1)
+    ell = Mesh(brick.vertices, {"hex8": brick.blocks["hex8"][(centres[:, 0] < 1.0) | (centres[:, 1] < 1.0)]})
+    found = ell.vertices[notch_vertices(ell)]
+    assert sorted(map(tuple, found)) == [(1.0, 1.0, 0.0), (1.0, 1.0, 0.5), (1.0, 1.0, 1.0)]
+    assert not notch_vertices(ell, angle=np.radians(271.0)).any() and notch_vertices(ell, angle=np.radians(269.0)).any()
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -10,6 +10,7 @@ from annotated_types import Ge, Le
 
 from finqd.errors import MeshError
 from finqd.mesh import Mesh
+from finqd.mesh_notches import with_quarter_nodes
 from finqd.mesh_sets import with_finger_sets
 from finqd.mesh_shapes import quadratic
 from finqd.plugins.swept_patches import PlaneMesh, corner_sines, mesh_patches
@@ -28,7 +29,8 @@ class Swept:
 
     ``size_mm``: edge length aimed at in the profile; ``layers``: elements along the thickness, null for
     thickness / (1.25 size), at least 2; ``least_edges``: elements through a wall at least; ``grading``: above 1, edges
-    shrink towards the notches between walls and ribs, with that exponent (patches only). A profile that comes in
+    shrink towards the notches between walls and ribs, with that exponent (patches only); ``notch_nodes``: "quarter"
+    puts mid-edge nodes next to a notch at a quarter of their edge, where they follow its stress (order 2 only). A profile that comes in
     patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by interpolation, without
     wedges; any other by gmsh. ``order``: 2 gives quadratic hexahedra (hex20, straight edges, a node in the middle of
     each); there is no quadratic wedge, so that a profile that leaves triangles is refused then. ``tetrahedra``: each
@@ -37,9 +39,10 @@ class Swept:
 
     size_mm: Annotated[float, Ge(0.2), Le(50)] = 4.0
     layers: Annotated[int, Ge(1), Le(200)] | None = None
-    least_edges: Annotated[int, Ge(1), Le(10)] = 1
+    least_edges: Annotated[int, Ge(1), Le(20)] = 1
     order: Literal[1, 2] = 1
     grading: Annotated[float, Ge(1), Le(4)] = 1.0
+    notch_nodes: Literal["middle", "quarter"] = "middle"
     tetrahedra: bool = False
 
     def mesh(self, solid: Solid) -> Mesh:
@@ -60,7 +63,11 @@ class Swept:
         mesh = self._sweep(plane, solid.thickness)
         if self.tetrahedra:
             mesh = Mesh(mesh.vertices, {"tet4": _tetrahedra(mesh.blocks["wedge6"])})
-        return with_finger_sets(quadratic(mesh) if self.order == 2 else mesh, solid.contact_line)
+        if self.order == 2:
+            mesh = quadratic(mesh)
+            if self.notch_nodes == "quarter":
+                mesh = with_quarter_nodes(mesh)
+        return with_finger_sets(mesh, solid.contact_line)
 
     def _plane(self, solid: Prism) -> PlaneMesh:
         patches = solid.patches or _single_patch(solid)
