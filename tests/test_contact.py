@@ -232,3 +232,25 @@ def test_friction_never_leaves_coulombs_cone() -> None:
     trajectory = simulate(scene, duration=0.15, time_step=0.005, watch=watch)
     assert trajectory.status == "ok", trajectory.reason
     assert max(on_cone) > 10 and max(inside) > 10
+
+
+def test_renewing_friction_bounds_comes_to_rest_where_full_renewals_swing() -> None:
+    """A wedge in which friction carries as much as it takes from the normal force: bounds = c - A bounds."""
+    contact = make("ball on soft").contact
+    generator = np.random.default_rng(5)
+    size = len(contact.bounds)
+    rate, target = generator.uniform(0.9, 1.1, size), generator.uniform(0.5, 1.0, size)
+    fixed = target / (1.0 + rate)
+
+    def renew(count: int) -> float:
+        contact._missing, contact.bounds = None, np.zeros(size)
+        for _ in range(count):
+            contact.bounds = contact._relaxed(target - rate * contact.bounds)
+            assert contact.bounds.min() >= 0.0
+        return float(np.max(np.abs(contact.bounds - fixed)))
+
+    assert renew(1) > 0.4 and renew(6) < 0.01
+    plain = np.zeros(size)
+    for _ in range(6):
+        plain = target - rate * plain
+    assert np.max(np.abs(plain - fixed)) > 0.2  # what full renewals leave

@@ -8,7 +8,8 @@ import pytest
 from finqd.mechanics import contact_force_kernels as force_kernels
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal, hold, largest_force
-from finqd.mechanics.contact_surface import contact_surface, lattice
+from finqd.mechanics.contact_surface import contact_shape, contact_surface, lattice
+from finqd.mechanics.elements import face_shape
 from finqd.mechanics.material import Material
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_matrix, rotation_vector, skew
@@ -335,3 +336,47 @@ def test_the_side_of_a_shallow_dent_stays_for_the_step_it_came_in() -> None:
     assert planes_in_a_dent(0.9 * threshold, fresh) == 2  # it came in, and has not clearly fallen away
     assert planes_in_a_dent(-0.9 * threshold, fresh) == 2
     assert planes_in_a_dent(-1.1 * threshold, fresh) == 1
+
+
+def test_the_far_side_of_a_ridge_is_no_side_of_a_dent() -> None:
+    """Two triangles make a floor; a third near by rises over it, first towards the point like a valley's other side,
+    then away from it like the far side of a ridge: extended, its plane then passes over the point."""
+    mm = 1e-3
+    floor = [(0, 0, 0), (mm, 0, 0), (mm, mm, 0), (0, mm, 0)]
+    faces = np.array([(0, 1, 2), (0, 2, 3), (4, 5, 6)])
+
+    def planes(third: list[tuple[float, float, float]]) -> np.ndarray:
+        normal, room = np.empty((8, 3)), 8
+        count = kernels.pair_features(
+            np.array(floor + third), faces, np.arange(3), np.tile(np.eye(3), (3, 1, 1)),
+            np.array([(0, 0), (0, 1), (0, 2)]), np.array([(0.9 * mm, 0.5 * mm, 2e-6)]), np.array([(0.0, 0.0, -1.0)]),
+            np.zeros(3), np.eye(3), mm, mm, mm, np.zeros(3, dtype=bool), np.empty(room, dtype=np.int64),
+            np.empty(room, dtype=np.int64), np.empty((room, 3)), normal, np.empty(room),
+        )
+        return -normal[:count]
+
+    valley = planes([(mm, 0, 0), (2 * mm, 0.4 * mm, 0.5 * mm), (mm, mm, 0)])
+    assert len(valley) == 2 and valley[0] == pytest.approx([0, 0, 1]) and valley[1][0] < -0.3
+    ridge = planes([(mm, 0, 0.4 * mm), (2 * mm, 0.4 * mm, 0.1 * mm), (mm, mm, 0.4 * mm)])
+    assert ridge == pytest.approx(np.array([[0, 0, 1]]))
+
+
+# -- faces as contact sees them ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("face", "nodes"), [
+    ("quad8", [(-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0)]),
+    ("tri6", [(0, 0), (1, 0), (0, 1), (0.5, 0), (0.5, 0.5), (0, 0.5)]),
+])  # fmt: skip
+def test_no_node_of_a_quadratic_face_is_pulled_back_by_a_push(face: str, nodes: list[tuple[float, float]]) -> None:
+    points = np.random.default_rng(3).uniform(-1.0 if face == "quad8" else 0.0, 1.0, (400, 2))
+    if face == "tri6":
+        points = points[points.sum(axis=1) < 1.0]
+    weights = contact_shape(face, points)
+    assert weights.min() >= 0.0
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(weights @ np.array(nodes), points, atol=1e-15)
+    np.testing.assert_allclose(contact_shape(face, np.array(nodes, dtype=float)), np.eye(len(nodes)), atol=1e-15)
+    assert face_shape(face, points).min() < -0.1  # the quadratic functions do pull
+    steps = contact_shape(face, points + 1e-7) - weights
+    assert np.abs(steps).max() < 1e-6  # continuous

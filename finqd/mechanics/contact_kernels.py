@@ -18,6 +18,7 @@ from numba import njit
 from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, signed_distance
 
 KEEP = 1.25  # a dent's side that has had a plane in this step keeps it up to this multiple of the distance
+RIDGE = 1e-6  # [m] how much deeper a point may lie under the side of a dent than under the surface
 RISE = 0.01  # slope over the first plane from which a neighbouring triangle makes a dent
 OPPOSED, FULLY_OPPOSED = 0.05, 0.35  # cosines between which two surfaces that look at each other come to push fully
 
@@ -372,6 +373,7 @@ def pair_features(
     ones are nearer to the wall's other side) gets the plane of the nearest triangle, or, outside beyond a convex
     edge, the plane across the direction of the distance. In a dent it gets the planes of the other triangles within
     ``near`` [m] as well, as far as they rise over the first: it cannot be in balance on one side of a crease alone.
+    A plane that the point is deeper under than under the surface itself is none of a dent's, but a ridge's far side.
     A pair that is kept loses its plane only where the triangle clearly falls away: in a shallow dent the sides would
     come and go with each renewal, and no step however short would end.
     """
@@ -414,6 +416,8 @@ def pair_features(
             _triangle(positions, faces, triangle_face, triangle_weight, pairs[c, 1], corner, other)
             middle = (corner[0] + corner[1] + corner[2]) / 3.0
             if np.dot(n, other) < 0.5 or np.dot(n, middle - foot) <= (-RISE if kept[c] else RISE) * near:
+                continue
+            if np.dot(other, p - corner[0]) < min(gap, 0.0) - RIDGE:
                 continue
             kept[c] = True
             closest_on_triangle(p, corner[0], corner[1], corner[2], bary)

@@ -87,6 +87,33 @@ def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(list(order), dtype=float) / n, share
 
 
+def contact_shape(face_type: str, xi: np.ndarray) -> np.ndarray:
+    """Return the weights of a face's nodes at local points ``xi`` (m, 2), as contact sees the face, shape (m, k).
+
+    They are never negative: a quadratic face counts as its linear pieces between neighbouring nodes, with the mean of
+    the mid-edge nodes in a quadrilateral's middle. The quadratic functions would pull corners back where a point in
+    the middle is pushed in, and an edge would find ripples.
+    """
+    if face_type == "quad8":
+        u, v = xi[:, 0], xi[:, 1]
+        (lu, mu, hu), (lv, mv, hv) = ((np.maximum(-x, 0.0), 1.0 - np.abs(x), np.maximum(x, 0.0)) for x in (u, v))
+        middle = 0.25 * mu * mv
+        return np.stack(
+            [lu * lv, hu * lv, hu * hv, lu * hv,
+             mu * lv + middle, hu * mv + middle, mu * hv + middle, lu * mv + middle], axis=1,
+        )
+    if face_type == "tri6":
+        share = np.column_stack([1.0 - xi.sum(axis=1), xi])
+        corners = np.maximum(2.0 * share - 1.0, 0.0)
+        inner = corners.sum(axis=1) == 0.0
+        mids = []
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            near = np.where(share[:, i] > 0.5, 2.0 * share[:, j], np.where(share[:, j] > 0.5, 2.0 * share[:, i], 0.0))
+            mids.append(np.where(inner, 1.0 - 2.0 * share[:, k], near))
+        return np.column_stack([corners, *mids])
+    return face_shape(face_type, xi)
+
+
 def _face_vectors(points: np.ndarray, face_type: str) -> np.ndarray:
     """Return area times unit normal of each face [m^2], shape (n_faces, 3)."""
     corners = points[:, : 4 if face_type.startswith("quad") else 3]
@@ -119,7 +146,7 @@ def _samples(
     found: list[tuple[np.ndarray, ...]] = []
     for n, m in np.unique(cells, axis=0):
         local, share = lattice(face_type, int(n), int(m))
-        shape = face_shape(face_type, local)
+        shape = contact_shape(face_type, local)
         which = np.flatnonzero((cells == (n, m)).all(axis=1))
         weight = np.zeros((len(which) * len(local), width))
         weight[:, : shape.shape[1]] = np.tile(shape, (len(which), 1))
@@ -161,7 +188,7 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
             face_corners.append(np.full(len(block), 4 if kind.startswith("quad") else 3))
             parts.append(_samples(body.mesh.vertices[block], kind, first_face, spacing, width))
             local = np.array(_TRIANGLES[kind], dtype=float).reshape(-1, 2)
-            corners = face_shape(kind, local).reshape(-1, 3, block.shape[1])
+            corners = contact_shape(kind, local).reshape(-1, 3, block.shape[1])
             weight = np.zeros((len(block) * len(corners), 3, width))
             weight[:, :, : block.shape[1]] = np.tile(corners, (len(block), 1, 1))
             triangles.append((np.repeat(np.arange(len(block)) + first_face, len(corners)), weight))

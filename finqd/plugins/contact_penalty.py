@@ -27,6 +27,7 @@ FEATURE_REACH = 4.0 * MM  # candidates (feature, triangle) are looked up again b
 FEATURE_MARGIN = 1.0 * MM  # features within this distance of a soft face get its tangent plane at the start of a step
 FEATURE_NEAR = 1.0 * MM  # and in a dent those of other triangles this near
 PLANES = 8  # planes a feature has at most, on the average
+LEAST_SHARE = 0.1  # of the way to their new values that friction bounds go at least in a renewal
 FEATURE_DEPTH = 1.5 * MM  # features deeper than this inside a wall belong to its other side
 
 
@@ -93,6 +94,8 @@ class PenaltyContact:
         self.relagged_forces = self.soft_forces
         self.penetration = 0.0
         self.start: State | None = None
+        self._missing: np.ndarray | None = None  # what the last renewal of this step found missing in the bounds [N]
+        self._share = 1.0  # of which it took that share
         self.last_rows_state: State | None = None
         self._pairs: list[np.ndarray] = []
         self._kept: list[list[np.ndarray]] = []
@@ -136,7 +139,9 @@ class PenaltyContact:
         self.fresh_shares = np.full(self.n_keys, np.nan)
         self._forget_dents()
         kernels.face_normals(state.positions, self.surface.faces, self.surface.face_corners, self.facing)
+        self._missing = None
         self.relag(state)
+        self._missing = None  # the start's forces belong to the last step
 
     def relag(self, state: State) -> float:
         """Renew the friction bounds at ``state``; return which share of them, in sum, has changed since last time."""
@@ -150,13 +155,32 @@ class PenaltyContact:
         np.add.at(bounds, keys, bound)  # a feature in a dent has several rows
         total = max(float(np.sum(bounds)), float(np.sum(self.bounds)))
         change = float(np.sum(np.abs(bounds - self.bounds))) / total if total > 0.0 else 0.0
-        self.bounds = bounds
+        wanted, self.bounds = bounds, self._relaxed(bounds)
         self.relagged_forces = self._forces_by_body(force)
+        bound = bound * np.divide(self.bounds, wanted, out=np.zeros_like(wanted), where=wanted > 0.0)[keys]
         self.friction = rows.friction(
             state=state, start=self.start, faces=self.surface.faces, bound=bound, slips=self.slips,
             ratio=self.options.friction_stiffness_ratio,
         )
         return change
+
+    def _relaxed(self, wanted: np.ndarray) -> np.ndarray:
+        """Return the friction bounds to go on with, between the last ones and those ``wanted`` by the normal forces.
+
+        Where friction carries much of the load, full renewals swing about Coulomb's law for ever: more friction, less
+        normal force, less friction. Aitken's relaxation finds the middle; the first renewal of a step is a full one.
+        Source: Kuettler and Wall, Comput. Mech. 43 (2008) 61, equation 44.
+        """
+        missing, before = wanted - self.bounds, self._missing
+        if before is None:
+            self._share = 1.0
+        else:
+            turn = missing - before
+            size = float(np.vdot(turn, turn))
+            if size > 0.0:
+                self._share = min(max(-self._share * float(np.vdot(before, turn)) / size, LEAST_SHARE), 1.0)
+        self._missing = missing
+        return self.bounds + self._share * missing
 
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J]."""
