@@ -107,8 +107,8 @@ def make_reference(
     first = done[0]
     return Reference(
         case=case.name, physics=physics, values=values, families=families, difference_percent=difference,
-        confirmed_by=other, design=first["design"], date=clock.strftime("%Y-%m-%d", clock.gmtime()), versions=first["versions"],
-        machine=first["machine"],
+        confirmed_by=other, design=first["design"], date=clock.strftime("%Y-%m-%d", clock.gmtime()),
+        versions=first["versions"], machine=first["machine"],
         repeat=f"finqd accuracy {case.name} --design {first['design']}{' --full' if full else ''} --reference compute",
     )
 

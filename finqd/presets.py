@@ -23,8 +23,8 @@ from finqd.errors import InputError
 DEFAULT = "standard"
 
 #: Quadratic bricks whose nodes follow the stress of the notches come ten times nearer to the converged press force than
-#: linear ones of 4 mm, but a sharp edge that crosses a finger's tip (the object ``triangle``) defeats contact on them; so
-#: only the finer presets use them.
+#: linear ones of 4 mm, but a sharp edge that crosses a finger's tip (the object ``triangle``) defeats contact on them;
+#: so only the finer presets use them.
 _QUARTER: dict[str, Any] = {"order": 2, "notch_nodes": "quarter"}
 
 #: preset -> section -> options by plugin, of which the preset chooses the first; the protocol has no plugin

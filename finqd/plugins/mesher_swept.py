@@ -30,11 +30,12 @@ class Swept:
     ``size_mm``: edge length aimed at in the profile; ``layers``: elements along the thickness, null for
     thickness / (1.25 size), at least 2; ``least_edges``: elements through a wall at least; ``grading``: above 1, edges
     shrink towards the notches between walls and ribs, with that exponent (patches only); ``notch_nodes``: "quarter"
-    puts mid-edge nodes next to a notch at a quarter of their edge, where they follow its stress (order 2 only). A profile that comes in
-    patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by interpolation, without
-    wedges; any other by gmsh. ``order``: 2 gives quadratic hexahedra (hex20, straight edges, a node in the middle of
-    each); there is no quadratic wedge, so that a profile that leaves triangles is refused then. ``tetrahedra``: each
-    hexahedron is cut into six, each wedge into three: another family of elements on the same nodes, to compare with.
+    puts mid-edge nodes next to a notch at a quarter of their edge, where they follow its stress (order 2 only). A
+    profile that comes in patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by
+    interpolation, without wedges; any other by gmsh. ``order``: 2 gives quadratic hexahedra (hex20, straight edges, a
+    node in the middle of each); there is no quadratic wedge, so that a profile that leaves triangles is refused then.
+    ``tetrahedra``: each hexahedron is cut into six, each wedge into three: another family of elements on the same
+    nodes, to compare with.
     """
 
     size_mm: Annotated[float, Ge(0.2), Le(50)] = 4.0

@@ -10,11 +10,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -183,37 +182,31 @@ def _failed(status: str, reason: str, *, dofs: int = 0) -> Press:
 
 # -- cases -------------------------------------------------------------------------------------------------------------
 
-#: force of the benchmark finger's press [N] that a study with two element families converged to; None: not yet known
-REFERENCE: float | None = None
-FAMILIES = ({"mesher.size_mm": 2}, {"mesher": {"name": "tetrahedral", "size_mm": 4, "order": 2}})
+#: force of the benchmark finger's press [N] by quadratic bricks with 108,072 unknowns, which the limit of linear bricks
+#: confirms: studies/reference_press_benchmark.json
+REFERENCE = 5.286
+BANDS = {"fine": 0.02, "standard": 0.05}  # preset -> what is asked of it
 
 
 def cases(fast: bool) -> Iterator[Case]:
-    """Yield the press of the benchmark finger: the default mesh against the reference, or two element families."""
-    def case(what: str, unit: str, reference: float, source: str, compute: Callable[[], float]) -> Case:
-        return Case(name="press", quantity=f"benchmark finger, 10 mm deep: {what}", unit=unit, reference=reference,
-                    source=source, band=0.05, absolute=False, compute=compute)
-
-    if REFERENCE is not None:
-        yield case("force, standard", "N", REFERENCE, "converged with two element families", benchmark_force)
-    elif not fast:
-        yield case("force, hex8 2 mm over tet10 4 mm", "-", 1.0, "two element families agree", _families)
-
-
-def _families() -> float:
-    first, second = (benchmark_force(json.dumps(overrides)) for overrides in FAMILIES)
-    return first / second
+    """Yield the press of the benchmark finger by the presets, against the converged force."""
+    for preset in ("fine",) if fast else BANDS:
+        yield Case(
+            name="press", quantity=f"benchmark finger, 10 mm deep: force, preset {preset}", unit="N",
+            reference=REFERENCE, source="converged, two element families", band=BANDS[preset], absolute=False,
+            compute=partial(benchmark_force, preset),
+        )
 
 
 @cache
-def benchmark_force(overrides: str = "{}") -> float:
-    """Return the force [N] of the benchmark finger's press with some values changed, as JSON."""
+def benchmark_force(preset: str) -> float:
+    """Return the force [N] of the benchmark finger's press by a preset."""
     from finqd.data import designs_folder
     from finqd.design import Design
     from finqd.presets import apply_preset
 
-    design = Design.from_json(designs_folder() / "benchmark.json").with_overrides(json.loads(overrides))
-    found = press_finger(apply_preset(design, "standard"))
+    design = Design.from_json(designs_folder() / "benchmark.json")
+    found = press_finger(apply_preset(design, preset))
     if found.status != "ok":
         raise Failed(f"{found.status}: {found.reason}")
     return found.force
