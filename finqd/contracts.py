@@ -138,8 +138,11 @@ class ContactPotential(Protocol):
     def begin_step(self, state: State) -> None:
         """Fix what is lagged over a step (reference points, normals, friction bounds) at its start."""
 
-    def relag(self, state: State) -> float:
-        """Renew the friction bounds at ``state``; return which share of them, in sum, has changed (0 to 2)."""
+    def relag(self, state: State, *, whole: bool = False) -> float:
+        """Renew the friction bounds at ``state``; return which share of them, in sum, has changed (0 to 2).
+
+        They may be relaxed, if that helps them to come to rest; ``whole``: they must not be.
+        """
 
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J]."""

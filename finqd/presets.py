@@ -45,8 +45,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "reference": {
         "mesher": {
-            "swept": {"size_mm": 1.5, "layers": 3, "least_edges": 2, "grading": 1.5, **_QUARTER},
-            "tetrahedral": {"size_mm": 1.5},
+            "swept": {"size_mm": 1.5, "layers": 2, "grading": 1.5, **_QUARTER}, "tetrahedral": {"size_mm": 1.5},
         },
         "protocol": {"time_step_ms": 2.5},
     },

@@ -124,7 +124,8 @@ class Motion:
             progress=old.progress,
         )
         if self.touching:
-            self.system.contact.relag(self.state)  # bounds from before, out of phase with a vibration, would feed it
+            # bounds from before, out of phase with a vibration, would feed it
+            self.system.contact.relag(self.state, whole=True)
         self.potential = self._forces()
         if len(ids):
             self.work += 0.5 * float(np.vdot(pushed + d.soft[ids], positions[ids] - old.positions[ids]))

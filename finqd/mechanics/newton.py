@@ -17,6 +17,7 @@ ARMIJO = 1e-4  # share of the linear decrease that a step must reach (Nocedal an
 LAG_FORCE = 0.1  # [N] what renewed contact may leave unbalanced at the end of a step,
 LAG_SHARE = 0.1  # or this share of the largest normal force on a body
 LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
+LAG_CHANGE = 0.5  # and the largest share of the friction bounds, in sum, that may differ from Coulomb's there
 PATIENCE = 4  # times as many renewals are granted before what they leave makes the step fail
 EARLY = 100.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
@@ -90,7 +91,7 @@ class Newton:
                 energy = increment.gradient(trial)
                 report.residual, report.where = system.residual()
                 progress = report.residual < LAG_PROGRESS * best_jump
-                if done and report.residual < best_jump:
+                if done and report.residual < best_jump and change <= LAG_CHANGE:
                     best, best_jump = trial, report.residual
                 steady = change <= options.friction_tolerance and report.residual <= LAG_FORCE
                 still = report.residual <= options.tolerance_N or steady
@@ -112,7 +113,11 @@ class Newton:
             trial = moved
             energy = increment.gradient(trial)
             report.residual, report.where = system.residual()
-        return trial if best is None else self._accept(best, best_jump)
+        if best is None:
+            left = f"{report.residual:.3g} N left on {report.where}"
+            report.reason = report.reason or f"friction did not come to rest: {left}"
+            return trial
+        return self._accept(best, best_jump)
 
     def _accept(self, best: State, jump: float) -> State:
         """End the step with the state that renewed contact disturbed least, by ``jump`` [N], if that is little.

@@ -27,7 +27,7 @@ FEATURE_REACH = 4.0 * MM  # candidates (feature, triangle) are looked up again b
 FEATURE_MARGIN = 1.0 * MM  # features within this distance of a soft face get its tangent plane at the start of a step
 FEATURE_NEAR = 1.0 * MM  # and in a dent those of other triangles this near
 PLANES = 8  # planes a feature has at most, on the average
-LEAST_SHARE = 0.1  # of the way to their new values that friction bounds go at least in a renewal
+LEAST_SHARE = 0.4  # of the way to their new values that friction bounds go at least in a renewal
 FEATURE_DEPTH = 1.5 * MM  # features deeper than this inside a wall belong to its other side
 
 
@@ -140,11 +140,13 @@ class PenaltyContact:
         self._forget_dents()
         kernels.face_normals(state.positions, self.surface.faces, self.surface.face_corners, self.facing)
         self._missing = None
-        self.relag(state)
-        self._missing = None  # the start's forces belong to the last step
+        self.relag(state, whole=True)
 
-    def relag(self, state: State) -> float:
-        """Renew the friction bounds at ``state``; return which share of them, in sum, has changed since last time."""
+    def relag(self, state: State, *, whole: bool = False) -> float:
+        """Renew the friction bounds at ``state``; return which share of them, in sum, has changed since last time.
+
+        ``whole``: without relaxation, so that what is left unbalanced is all that Coulomb's law leaves.
+        """
         self._hold_geometry(state)
         self._find(state)
         bounds = np.zeros(self.n_keys)
@@ -155,7 +157,7 @@ class PenaltyContact:
         np.add.at(bounds, keys, bound)  # a feature in a dent has several rows
         total = max(float(np.sum(bounds)), float(np.sum(self.bounds)))
         change = float(np.sum(np.abs(bounds - self.bounds))) / total if total > 0.0 else 0.0
-        wanted, self.bounds = bounds, self._relaxed(bounds)
+        wanted, self.bounds = bounds, bounds if whole else self._relaxed(bounds)
         self.relagged_forces = self._forces_by_body(force)
         bound = bound * np.divide(self.bounds, wanted, out=np.zeros_like(wanted), where=wanted > 0.0)[keys]
         self.friction = rows.friction(
