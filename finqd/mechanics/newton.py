@@ -91,7 +91,8 @@ class Newton:
                 energy = increment.gradient(trial)
                 report.residual, report.where = system.residual()
                 progress = report.residual < LAG_PROGRESS * best_jump
-                if done and report.residual < best_jump and change <= LAG_CHANGE:
+                light = float(np.sum(system.contact.relagged_forces)) <= LAG_FORCE
+                if done and report.residual < best_jump and (light or change <= LAG_CHANGE):
                     best, best_jump = trial, report.residual
                 steady = change <= options.friction_tolerance and report.residual <= LAG_FORCE
                 still = report.residual <= options.tolerance_N or steady
