@@ -39,9 +39,11 @@ def main() -> None:
             parser.exit(1, f"{study}: the preset {name} is not among its rungs\n")
         error = 100.0 * (row["values"]["force_N"] / exact - 1.0)
         document["presets"][name] |= {
-            "settings": settings, "press_force_error_percent": round(abs(error), 2), "press_seconds": round(row["seconds"], 2)
+            "settings": settings, "press_force_error_percent": round(abs(error), 2),
+            "press_seconds": round(row["seconds"], 2),
         }
-        print(f"{name:10} {row['values']['force_N']:8.3f} N  {error:+7.1f} %  {row['seconds']:7.1f} s  {row['dofs']} dofs")
+        force = row["values"]["force_N"]
+        print(f"{name:10} {force:8.3f} N  {error:+7.1f} %  {row['seconds']:7.1f} s  {row['dofs']} dofs")
     write_whole(path, json.dumps(document, indent=2) + "\n")
 
 
