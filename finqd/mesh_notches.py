@@ -10,6 +10,7 @@ Sources: Henshell and Shaw, Int. J. Numer. Methods Eng. 9 (1975) 495; Barsoum, I
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 
 from finqd.mesh import Mesh
 from finqd.mesh_reference import MID_EDGES
@@ -23,24 +24,10 @@ def notch_vertices(mesh: Mesh, *, angle: float = REENTRANT) -> np.ndarray:
 
     Mid-edge nodes are not among them: the boundary is looked at as flat triangles between corners.
     """
-    triangles = mesh.surface_triangles()
-    corners = mesh.vertices[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    owner = np.tile(np.arange(len(triangles)), 3)
-    _, which, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    which = which.ravel()
-    order = np.argsort(which, kind="stable")
-    order = order[counts[which[order]] == 2]  # an edge at which four faces meet belongs to no one notch
-    one, other = order[::2], order[1::2]
-    along = mesh.vertices[edges[one, 1]] - mesh.vertices[edges[one, 0]]
-    along /= np.linalg.norm(along, axis=1)[:, None]
-    turn = np.cross(normals[owner[one]], normals[owner[other]])
-    cosine = np.sum(normals[owner[one]] * normals[owner[other]], axis=1)
-    interior = np.pi - np.arctan2(np.sum(turn * along, axis=1), cosine)
+    surface = trimesh.Trimesh(mesh.vertices, mesh.surface_triangles(), process=False)
+    notch = ~surface.face_adjacency_convex & (surface.face_adjacency_angles > angle - np.pi)
     found = np.zeros(mesh.n_vertices, dtype=bool)
-    found[edges[one[interior > angle]]] = True
+    found[surface.face_adjacency_edges[notch]] = True
     return found
 
 

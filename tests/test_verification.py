@@ -12,8 +12,9 @@ import pytest
 from click.testing import CliRunner
 
 from finqd import registry
+from finqd.accuracy_reference import read_reference
 from finqd.cli import finqd
-from finqd.data import designs_folder
+from finqd.data import designs_folder, studies_folder
 from finqd.design import Design
 from finqd.errors import InputError, MeshError
 from finqd.mechanics.material import Material
@@ -224,6 +225,11 @@ def test_the_cylinder_just_touches_the_contact_face(benchmark: Design) -> None:
 def test_a_press_refuses_nonsense(benchmark: Design, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         press_finger(benchmark, **settings)
+
+
+def test_the_press_is_held_against_the_reference_that_ships() -> None:
+    shipped = read_reference(studies_folder() / "reference_press_benchmark.json")
+    assert press.REFERENCE == pytest.approx(shipped.values["force_N"], rel=1e-4)
 
 
 def test_what_fails_in_a_press_is_its_status(benchmark: Design, monkeypatch: pytest.MonkeyPatch) -> None:
