@@ -21,7 +21,7 @@ GRAVITY = 9.81  # [m/s^2]
 PAD = Material(youngs_modulus=1e7, poisson_ratio=0.0, density=1000.0)  # nu 0: friction cannot change its push
 PAD_STROKE = 0.0215 * MM  # makes about 5 N
 #: the block that is 1 % too steep is driven by 0.5 mN: no default tolerance (0.05 mN a vertex) can judge that to 1 %
-SLOPE_STEPPER = {"name": "implicit_euler", "tolerance_N": 1e-7}
+SLOPE_STEPPER = {"name": "implicit_euler", "tolerance_N": 1e-7, "friction_tolerance": 1e-4}
 
 
 def block_on_slope(
