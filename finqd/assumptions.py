@@ -43,9 +43,28 @@ def effects_of(design: Design) -> dict[str, str]:
         if not getattr(design.plugin("stepper"), "inertia", True):
             found["inertia"] = f"off for the fingers: the stepper {stepper}; on for the object"
         found["damping"] = f"off: only what the stepper {stepper} itself dissipates"
+    damped = _damping(design)
+    if damped:
+        found["damping"] = damped
     for kind in ("elasticity", "stepper", "contact"):
         found.update(getattr(design.plugin(kind), "effects", {}))
     return found
+
+
+def _damping(design: Design) -> str:
+    """Return what the material's damping does, or nothing if it has none."""
+    material = design.resolved()["material"]
+    parts = [
+        text.format(material[key])
+        for key, text in (("rayleigh_mass_per_s", "{:g} per s by the mass"),
+                          ("rayleigh_stiffness_ms", "{:g} ms by the stiffness")) if material[key]
+    ]
+    if not parts:
+        return ""
+    stepper = design.spec("stepper")["name"]
+    if not getattr(design.plugin("stepper"), "inertia", True):
+        return f"off: the stepper {stepper} takes no notice of the material's damping ({' and '.join(parts)})"
+    return f"on: of the material, {' and '.join(parts)}; besides what the stepper {stepper} itself dissipates"
 
 
 #: finqd's own choices where the paper gives none

@@ -176,7 +176,9 @@ class Contact(Protocol):
 class Stepper(Protocol):
     """One step in time.
 
-    A class may declare ``inertia: ClassVar[bool] = False``: soft bodies have none. Then they need not fall freely.
+    A class may declare ``inertia: ClassVar[bool] = False``: soft bodies have none. Then they need not fall freely, and
+    the material's damping has nothing to do. It may declare ``stiffness_damping: ClassVar[bool] = False``: it refuses
+    materials with that. All others obey ``system.damping``, as what steps by `finqd.mechanics.incremental` does.
     """
 
     def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:

@@ -53,6 +53,12 @@ class MaterialSection:
     youngs_modulus_MPa: Annotated[float, Gt(0), Le(1e6)] = _constant(11.6, "Young's modulus")
     poisson_ratio: Annotated[float, Ge(0), Le(0.4999)] = _constant(0.49, "Poisson's ratio")
     density_kg_m3: Annotated[float, Gt(0), Le(30000)] = _constant(1150.0, "density")
+    rayleigh_mass_per_s: Annotated[float, Ge(0), Le(1e5)] = _constant(
+        0.0, "Rayleigh damping by the mass (alpha): rate at which momentum decays; brakes motion as a whole too"
+    )
+    rayleigh_stiffness_ms: Annotated[float, Ge(0), Le(1e4)] = _constant(
+        0.0, "Rayleigh damping by the stiffness (beta): stress against the rate of strain; brakes no rigid motion"
+    )
 
     def material(self) -> Material:
         """Return the material in SI."""
@@ -60,6 +66,8 @@ class MaterialSection:
             youngs_modulus=self.youngs_modulus_MPa * si_factor("youngs_modulus_MPa"),
             poisson_ratio=self.poisson_ratio,
             density=self.density_kg_m3 * si_factor("density_kg_m3"),
+            rayleigh_mass=self.rayleigh_mass_per_s * si_factor("rayleigh_mass_per_s"),
+            rayleigh_stiffness=self.rayleigh_stiffness_ms * si_factor("rayleigh_stiffness_ms"),
         )
 
 
@@ -91,7 +99,18 @@ def read_document(document: Mapping[str, Any], place: str) -> tuple[dict[str, An
     for kind in DEFAULT_PLUGINS:
         if kind in document:
             read[kind] = _read_plugins(kind, document[kind], join(place, kind))
+    _check_damping(read, join(join(place, "material"), "rayleigh_stiffness_ms"))
     return {key: read[key] for key in KEYS if key in read}, warnings
+
+
+def _check_damping(read: Mapping[str, Any], where: str) -> None:
+    """Raise ``InputError`` for a stiffness damping that the stepper does not know."""
+    given = read.get("material", {}).get("rayleigh_stiffness_ms", 0.0)
+    if given:
+        spec = read.get("stepper", DEFAULT_PLUGINS["stepper"])
+        name = spec if isinstance(spec, str) else spec["name"]
+        if not getattr(registry.load("stepper", name), "stiffness_damping", True):
+            raise InputError(f"must be 0 with the stepper {name}, which has no damping by the stiffness", where)
 
 
 def read_number(parameter: Parameter, value: Any, where: str) -> float:

@@ -132,6 +132,7 @@ class SoftBody:
     loads: np.ndarray  # dead loads [N], (n_vertices, 3)
     velocities: np.ndarray  # at the start [m/s], (n_vertices, 3)
     start_positions: np.ndarray  # at the start [m], (n_vertices, 3): the rest positions unless set
+    extra_masses: np.ndarray  # beside the material's own [kg], (n_vertices,): inertia and weight, no stiffness
     drives: list[tuple[np.ndarray, Motion]] = field(default_factory=list)
 
     def vertices(self, where: str | np.ndarray) -> np.ndarray:
@@ -157,6 +158,16 @@ class SoftBody:
         """Spread a dead load [N], in all ``force``, evenly over vertices (consistent tractions: `face_tractions`)."""
         nodes = self.vertices(where)
         self.loads[nodes] += np.asarray(force, dtype=float) / len(nodes)
+
+    def add_mass(self, where: str | np.ndarray, mass: float) -> None:
+        """Spread a mass [kg] that hangs on the body, in all ``mass``, evenly over vertices: it has inertia and weight.
+
+        Raises InputError for one that is negative or not finite.
+        """
+        if not 0.0 <= mass < math.inf:
+            raise InputError(f"a mass must be at least 0 kg, not {mass}", self.name)
+        nodes = self.vertices(where)
+        self.extra_masses[nodes] += mass / len(nodes)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -213,7 +224,7 @@ class Scene:
             name=self._new_name(name or f"soft {len(self.soft_bodies)}"), mesh=mesh, material=material,
             elasticity=elasticity, first_vertex=self.n_vertices, fixed=np.zeros(shape, dtype=bool),
             loads=np.zeros(shape), velocities=np.tile(np.asarray(velocity, dtype=float), (shape[0], 1)),
-            start_positions=mesh.vertices.copy(),
+            start_positions=mesh.vertices.copy(), extra_masses=np.zeros(shape[0]),
         )
         self.soft_bodies.append(body)
         return body

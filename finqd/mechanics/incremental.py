@@ -16,7 +16,7 @@ from finqd.mechanics.system import System
 class Past:
     """What a step knows of the motion so far: in a backward formula, x = origin + h v and v = base + h a at its end.
 
-    h: effective step [s]; ratio: this step over the one before (0: that one is not used)
+    h: effective step [s]; earlier: share b of the state before in all origins, (1 + b) x0 - b x_before
     origin, inertial: where each soft vertex was, and would be without forces, origin + h base [m], (n_vertices, 3)
     rigid_origin, rigid_inertial: the same of the rigid centres of mass [m], (n_rigid, 3)
     turns: rotation vector since the step's start of each rigid body without torques [rad], (n_rigid, 3)
@@ -25,7 +25,7 @@ class Past:
     """
 
     h: float
-    ratio: float = 0.0
+    earlier: float = 0.0
     origin: np.ndarray
     inertial: np.ndarray
     rigid_origin: np.ndarray
@@ -88,7 +88,7 @@ def bdf2_past(system: System, state: State, dt: float) -> Past:
         turns[r] = h * np.linalg.solve(a_matrix, momenta[r]) - b * rotation_vector(then @ now.T)
         inertias[r] = left.T @ a_matrix
     return Past(
-        h=h, ratio=ratio, origin=origin, inertial=origin + h * base, rigid_origin=rigid_origin,
+        h=h, earlier=b, origin=origin, inertial=origin + h * base, rigid_origin=rigid_origin,
         rigid_inertial=rigid_origin + h * rigid_base, turns=turns, inertias=inertias, momenta=momenta,
     )
 
@@ -104,8 +104,9 @@ class Increment:
     r"""Inertia plus all potentials, whose minimum is the implicit step (Ortiz and Stainier 1999).
 
     Soft: m |x - x^|^2 / (2 h^2) a vertex, x^ where it would be without forces and h the formula's effective step
-    (see `Past`). Rigid: the same of the centre of mass, and (t - t^)^T J (t - t^) / (2 h^2) with the rotation vector t
-    of the step. All forces are those at the end of the step, so contact and friction do not know which formula it is.
+    (see `Past`), and the dissipation of damped materials (`finqd.mechanics.damping`). Rigid: the same of the centre of
+    mass, and (t - t^)^T J (t - t^) / (2 h^2) with the rotation vector t of the step. All forces are those at the end of
+    the step, so contact and friction do not know which formula it is.
     """
 
     def __init__(
@@ -117,6 +118,8 @@ class Increment:
         self.progress = system.advanced_progress(state, dt)
         self.masses = system.masses if soft_inertia else np.zeros_like(system.masses)
         self.vertex_weight = np.where(system.fixed, 0.0, (self.masses / past.h**2)[:, None])
+        #: of the materials over this step, None where there is none: it resists motion, as inertia does
+        self.damping = system.damping.over(state, past) if system.damping is not None and soft_inertia else None
         #: loads that do not act yet [N], (n_vertices, 3); None: all do
         self.withheld = None if load_share == 1.0 else (1.0 - load_share) * system.forces
         #: a typical energy [J], for the rounding of differences of energies
@@ -162,6 +165,8 @@ class Increment:
     def energy(self, state: State) -> float:
         """Return the incremental potential [J]."""
         energy = self._inertia_energy(state, self._turns(state)) + self.system.energy(state)
+        if self.damping is not None:
+            energy += self.damping.energy(state.positions)
         return energy + self._withheld_energy(state)
 
     def gradient(self, state: State) -> float:
@@ -171,6 +176,8 @@ class Increment:
         turns = self._turns(state)
         energy = system.add_gradient(state) + self._inertia_energy(state, turns)
         d.soft += self.vertex_weight * (state.positions - past.inertial)
+        if self.damping is not None:
+            energy += self.damping.add_gradient(state.positions, d.soft)
         if self.withheld is not None:
             d.soft += self.withheld
         d.rigid[:, :3] += (system.rigid_masses / past.h**2)[:, None] * (state.rigid_positions - past.rigid_inertial)
@@ -185,6 +192,8 @@ class Increment:
         d.clear_hessian()
         system.add_hessian(state, projected=projected)
         add_diagonal(system.pattern.indptr, system.pattern.indices, self.masses / h**2, d.blocks)
+        if self.damping is not None:
+            self.damping.add_hessian(state.positions, d.blocks, projected=projected)
         for b, turn in enumerate(self._turns(state)):
             jacobian = inverse_left_jacobian(turn)
             body = slice(6 * b, 6 * b + 6)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from finqd.mechanics.assembly_kernels import hold, largest_force
+from finqd.mechanics.damping import damping_of
 from finqd.mechanics.mass import lumped_masses
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.state import Direction, State
@@ -50,6 +51,7 @@ class System:
     rigid_masses [kg], (n_rigid,); rigid_inertias: body frame [kg m^2], (n_rigid, 3, 3); rigid_forces [N], (n_rigid, 3)
     rigid_sizes: radius that turns a torque into a force for the residual [m], (n_rigid,)
     fixed: bool, (n_vertices, 3); rigid_held: bool, (n_rigid,)
+    damping: of the materials, None where they have none
     shortest_step: [s] a step this short is not rejected for its error any more
     """
 
@@ -61,7 +63,8 @@ class System:
         def stacked(rows: list[np.ndarray], *shape: int) -> np.ndarray:
             return np.concatenate(rows) if rows else np.zeros((0, *shape))
 
-        self.masses = stacked([lumped_masses(b.mesh, b.material.density) for b in soft])
+        own = [lumped_masses(b.mesh, b.material.density) for b in soft]
+        self.masses = stacked([mass + b.extra_masses for mass, b in zip(own, soft, strict=True)])
         self.forces = stacked([b.loads for b in soft], 3) + self.masses[:, None] * scene.gravity
         self.fixed = stacked([b.fixed for b in soft], 3).astype(bool)
         self.rigid_masses = np.array([b.shape.mass for b in rigid])
@@ -70,10 +73,14 @@ class System:
         self.rigid_held = np.array([b.held for b in rigid], dtype=bool)
         self.rigid_sizes = np.array([b.shape.bounding_radius for b in rigid])
         self.potentials = [b.elasticity.potential(b.mesh, b.material, first_vertex=b.first_vertex) for b in soft]
-        self.pattern = BlockPattern.from_cliques(n, [c for p in self.potentials for c in p.cliques])
+        self.damping = damping_of(soft, own, self.masses)
+        viscous = () if self.damping is None else self.damping.cliques
+        self.pattern = BlockPattern.from_cliques(n, [*(c for p in self.potentials for c in p.cliques), *viscous])
         self.slots = [tuple(self.pattern.slots(c) for c in p.cliques) for p in self.potentials]
         self.contact = contact.potential(scene)
         self.contact.bind(self.pattern)
+        if self.damping is not None:
+            self.damping.bind(self.pattern)
         self.derivatives = Derivatives(
             soft=np.zeros((n, 3)), rigid=np.zeros((m, 6)), blocks=np.zeros((self.pattern.n_blocks, 3, 3)),
             coupling=np.zeros((3 * n, 6 * m)), rigid_matrix=np.zeros((6 * m, 6 * m)),

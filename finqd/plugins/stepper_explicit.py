@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
+from finqd.errors import InputError
 from finqd.mechanics.explicit import Motion, SubstepOptions, elastic_rate, substeps
 from finqd.mechanics.state import State, StepReport
 from finqd.mechanics.system import System
@@ -15,11 +17,20 @@ class Explicit(SubstepOptions):
     """Central differences, no matrix: accurate in time, conserves energy, and takes microseconds a substep.
 
     Contact is the penalty's spring and nothing else: what falls on a plane rebounds. For what rests, give a
-    ``damping_per_s``, or start in equilibrium. Options: see `finqd.mechanics.explicit.SubstepOptions`.
+    ``damping_per_s``, or start in equilibrium. Damping of a material by its stiffness would make stable substeps
+    thousands of times shorter, and is refused. Options: see `finqd.mechanics.explicit.SubstepOptions`.
     """
 
+    stiffness_damping: ClassVar[bool] = False
+
     def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:
-        """Return the state after ``dt`` [s], or ``state`` itself and the reason."""
+        """Return the state after ``dt`` [s], or ``state`` itself and the reason.
+
+        Raises InputError for a material with damping by the stiffness.
+        """
+        if system.damping is not None and system.damping.viscous:
+            raise InputError("must be 0 with the stepper explicit, which has no damping by the stiffness",
+                             "material.rayleigh_stiffness")
         system.contact.begin_step(state)
         verlet = Verlet(rate=elastic_rate(system, state), damping=self.damping_per_s)
         return substeps(Motion(system, state, dt), verlet, self)
@@ -40,9 +51,10 @@ class Verlet:
     def advance(self, motion: Motion, h: float, time: float) -> None:
         """Take ``motion`` on by ``h`` [s], to ``time`` [s]."""
         half, decay = 0.5 * h, math.exp(-0.5 * self.damping * h)
-        gradient = motion.system.derivatives.soft
-        motion.velocities = decay * (motion.velocities - half * motion.inverse_masses * gradient)
+        gradient, damping = motion.system.derivatives.soft, motion.system.damping
+        soft_decay = decay if damping is None else decay * damping.decay(half)
+        motion.velocities = soft_decay * (motion.velocities - half * motion.inverse_masses * gradient)
         motion.kick(half, decay)
         motion.drift(h, time)
-        motion.velocities = decay * (motion.velocities - half * motion.inverse_masses * gradient)
+        motion.velocities = soft_decay * (motion.velocities - half * motion.inverse_masses * gradient)
         motion.kick(half, decay)

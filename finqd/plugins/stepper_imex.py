@@ -48,10 +48,12 @@ class Imex(SubstepOptions):
 
 
 class LinearlyImplicit:
-    """(M + h^2 K) dv = h (f(x) - h K v), x + h (v + dv): linearly implicit Euler (Baraff and Witkin 1998, eq. 6).
+    """(M + h D + h^2 K) dv = h (f(x) - (D + h K) v), x + h (v + dv): linearly implicit Euler (Baraff and Witkin 1998,
+    eq. 6).
 
-    K: stiffness of the elasticity at the start of the step, made positive semidefinite; f: all forces at the start of
-    the substep, so that contact and rigid bodies are stepped by symplectic Euler.
+    K: stiffness of the elasticity at the start of the step, made positive semidefinite, and D its damping, where the
+    material has one; f: all forces at the start of the substep, so that contact and rigid bodies are stepped by
+    symplectic Euler. Damping by the mass is a decay of the velocities after it.
     """
 
     rate, binary = 0.0, True
@@ -62,6 +64,11 @@ class LinearlyImplicit:
         for potential, slots in zip(system.potentials, system.slots, strict=True):
             potential.add_hessian(state.positions, slots, self.stiffness, projected=True)
         self.product = system.pattern.matrix(self.stiffness)
+        self.viscosity, self.resistance = None, None
+        if system.damping is not None and system.damping.viscous:
+            self.viscosity = np.zeros_like(self.stiffness)
+            system.damping.add_viscosity(state.positions, self.viscosity)
+            self.resistance = system.pattern.matrix(self.viscosity)
         self.blocks, self.h = self.stiffness, 0.0
         self.cg_iterations = self.factorisations = 0
 
@@ -75,12 +82,15 @@ class LinearlyImplicit:
             velocities[ids] = (motion.course.positions(time) - motion.state.positions[ids]) / h
             strained = (self.product @ velocities.ravel()).reshape(-1, 3)
             impulse = -h * (system.derivatives.soft + h * strained)
+            if self.resistance is not None:
+                impulse -= h * (self.resistance @ velocities.ravel()).reshape(-1, 3)
             impulse[system.fixed] = 0.0
             none = np.zeros((impulse.size, 0)), np.zeros((0, 0))
             solution = self.solver.solve(self.blocks, *none, impulse, np.zeros(0))
             self.cg_iterations += solution.iterations
             self.factorisations += int(solution.factorised)
-            motion.velocities = decay * np.where(system.fixed, 0.0, velocities + solution.soft)
+            soft_decay = decay if system.damping is None else decay * system.damping.decay(h)
+            motion.velocities = soft_decay * np.where(system.fixed, 0.0, velocities + solution.soft)
         motion.kick(h, decay)
         motion.drift(h, time)
 
@@ -90,5 +100,7 @@ class LinearlyImplicit:
             return
         system = self.system
         self.blocks, self.h = h * h * self.stiffness, h
+        if self.viscosity is not None:
+            self.blocks += h * self.viscosity
         add_diagonal(system.pattern.indptr, system.pattern.indices, system.masses, self.blocks)
         hold(system.pattern.indptr, system.pattern.indices, system.fixed, self.blocks, np.zeros((0, 0)))
