@@ -52,9 +52,9 @@ class Verlet:
         """Take ``motion`` on by ``h`` [s], to ``time`` [s]."""
         half, decay = 0.5 * h, math.exp(-0.5 * self.damping * h)
         gradient, damping = motion.system.derivatives.soft, motion.system.damping
-        soft_decay = decay if damping is None else decay * damping.decay(half)
-        motion.velocities = soft_decay * (motion.velocities - half * motion.inverse_masses * gradient)
+        drag = 1.0 if damping is None else damping.decay(half)  # before the first kick, after the last: symmetric
+        motion.velocities = decay * (drag * motion.velocities - half * motion.inverse_masses * gradient)
         motion.kick(half, decay)
         motion.drift(h, time)
-        motion.velocities = soft_decay * (motion.velocities - half * motion.inverse_masses * gradient)
+        motion.velocities = drag * decay * (motion.velocities - half * motion.inverse_masses * gradient)
         motion.kick(half, decay)
