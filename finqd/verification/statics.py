@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -19,6 +20,7 @@ from finqd.units import MM
 from finqd.verification.cases import Failed, checked
 
 SILICONE = Material(youngs_modulus=263_824, poisson_ratio=0.499, density=1070.0)
+SILICONE_GRAVITY = 9.807  # [m/s^2]
 STRIP = Material(youngs_modulus=1e7, poisson_ratio=0.0, density=1000.0)
 LENGTH = 1.0  # of the strip [m]
 DEPTH = 0.02  # of the strip, in the direction in which it bends [m]
@@ -110,19 +112,22 @@ def roll_up(divisions: tuple[int, int, int] = (60, 1, 1), element: str = "hex8",
 
 
 def silicone_scene(
-    divisions: tuple[int, int, int], element: str, elasticity: str, force: float
+    divisions: tuple[int, int, int], element: str, elasticity: str, weight: float, damping: float = 0.0
 ) -> tuple[Scene, SoftBody]:
-    """Return a silicone bar, 100 x 30 x 30 mm, clamped at its root, with ``force`` [N] down on the tip's top edge."""
-    scene = Scene(gravity=(0.0, 0.0, -9.807))
+    """Return a silicone bar, 100 x 30 x 30 mm, clamped at its root, with ``weight`` [N] hung on the tip's top edge.
+
+    What hangs there has the inertia of its mass. damping: of the silicone, by its stiffness [s]
+    """
+    scene = Scene(gravity=(0.0, 0.0, -SILICONE_GRAVITY))
     mesh = box_mesh((100 * MM, 30 * MM, 30 * MM), divisions, element)
-    beam = scene.add_soft(mesh, SILICONE, elasticity=elasticity)
+    beam = scene.add_soft(mesh, replace(SILICONE, rayleigh_stiffness=damping), elasticity=elasticity)
     beam.fix("xmin")
     edge = top_edge(beam)
     across = mesh.vertices[edge, 1]
     width = np.gradient(np.sort(across))  # a node's share of the edge, by the trapezoidal rule
     share = np.empty(len(edge))
     share[np.argsort(across)] = np.where(np.isin(np.arange(len(edge)), (0, len(edge) - 1)), 0.5, 1.0) * width
-    beam.loads[edge, 2] -= force * share / share.sum()
+    beam.extra_masses[edge] += weight / SILICONE_GRAVITY * share / share.sum()
     return scene, beam
 
 
@@ -132,8 +137,8 @@ def top_edge(beam: SoftBody) -> np.ndarray:
 
 
 @cache
-def silicone_sag(divisions: tuple[int, int, int], force: float = 0.0, element: str = "hex8",
+def silicone_sag(divisions: tuple[int, int, int], weight: float = 0.0, element: str = "hex8",
                  elasticity: str = "corotated") -> float:
-    """Return how far [m] the tip's top edge of the silicone bar sags at rest."""
-    scene, beam = silicone_scene(divisions, element, elasticity, force)
+    """Return how far [m] the tip's top edge of the silicone bar sags at rest, with ``weight`` [N] hung on it."""
+    scene, beam = silicone_scene(divisions, element, elasticity, weight)
     return float(-at_rest(scene, top_edge(beam), time_step=0.1, steps=40)[2])
