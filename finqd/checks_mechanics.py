@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -195,7 +196,33 @@ def check_repeats_itself(kind: str, name: str) -> None:
     assert np.array_equal(ends[0], ends[1]), "the same scene gave another result"
 
 
-STEPPER = (check_falls_freely, check_holds_what_is_fixed, check_repeats_itself)
+def check_obeys_damping(kind: str, name: str) -> None:
+    """Drag of the mass gives a fall its final speed, and a strain relaxes by exp(-t / beta) where beta is long.
+
+    A stepper without inertia has nothing to damp; one that declares ``stiffness_damping = False`` refuses the latter.
+    """
+    if not _has_inertia(name):
+        return
+    rate, time = 20.0, 0.1
+    states = _simulated(_box_scene(rayleigh_mass=rate), duration=time, time_step=2e-3, stepper=name)
+    speed, exact = -float(states[-1].velocities[:, 2].mean()), GRAVITY / rate * (1.0 - np.exp(-rate * time))
+    assert abs(speed / exact - 1.0) < 0.1, f"against drag it falls with {speed:.3g} m/s, not with {exact:.3g} m/s"
+    relaxing = _box_scene(rayleigh_stiffness=0.1)
+    body = relaxing.soft_bodies[0]
+    relaxing.gravity = np.zeros(3)
+    body.start_positions *= (1.02, 1.0, 1.0)
+    if not getattr(registry.load("stepper", name), "stiffness_damping", True):
+        try:
+            _simulated(relaxing, duration=0.01, time_step=0.01, stepper=name)
+        except InputError:
+            return
+        raise AssertionError("it declares that it has no damping by the stiffness, and takes a material with it")
+    end = _simulated(relaxing, duration=0.05, time_step=2.5e-3, stepper=name)[-1]
+    left = (float(np.ptp(end.positions[:, 0])) / SIZE[0] - 1.0) / 0.02
+    assert abs(left / np.exp(-0.5) - 1.0) < 0.1, f"after half the time constant {left:.2f} of a strain is left"
+
+
+STEPPER = (check_falls_freely, check_holds_what_is_fixed, check_repeats_itself, check_obeys_damping)
 
 
 # -- contact -----------------------------------------------------------------------------------------------------------
@@ -293,14 +320,14 @@ def _dense_hessian(potential: Any, positions: np.ndarray, *, projected: bool) ->
     return pattern.matrix(blocks).toarray()
 
 
-def _box_scene(height: float = 0.1) -> Scene:
+def _box_scene(height: float = 0.1, **constants: float) -> Scene:
     from finqd.mesh_shapes import box_mesh
     from finqd.scene import Scene
 
     scene = Scene(gravity=(0.0, 0.0, -GRAVITY))
     lifted = np.eye(4)
     lifted[2, 3] = height
-    scene.add_soft(box_mesh(SIZE, (3, 2, 1)).transformed(lifted), RUBBER)
+    scene.add_soft(box_mesh(SIZE, (3, 2, 1)).transformed(lifted), replace(RUBBER, **constants))
     return scene
 
 

@@ -109,6 +109,27 @@ class Constant:
         return {"volume_mm3": 1.0}
 
 @dataclass(frozen=True)
+class Heedless:
+    """Knows no damping at all."""
+    def step(self, system, state, dt):
+        system.damping = None
+        return registry.create("stepper", "implicit_euler").step(system, state, dt)
+
+@dataclass(frozen=True)
+class Inviscid:
+    """Knows drag only."""
+    def step(self, system, state, dt):
+        system.damping.viscous = ()
+        return registry.create("stepper", "implicit_euler").step(system, state, dt)
+
+@dataclass(frozen=True)
+class Modest:
+    """Says that it has no damping by the stiffness, and does not mind."""
+    stiffness_damping: ClassVar = False
+    def step(self, system, state, dt):
+        return registry.create("stepper", "implicit_euler").step(system, state, dt)
+
+@dataclass(frozen=True)
 class Sinking:
     """No contact at all."""
     def potential(self, scene):
@@ -133,6 +154,9 @@ class Sinking:
         ("actuation", "Opening", "closes_towards_the_axis", "a finger opens"),
         ("features", "Constant", "measures_what_it_names", "it declares"),
         ("features", "Constant", "tells_designs_apart", "three different designs"),
+        ("stepper", "Heedless", "obeys_damping", "against drag it falls"),
+        ("stepper", "Inviscid", "obeys_damping", "of a strain is left"),
+        ("stepper", "Modest", "obeys_damping", "takes a material with it"),
         ("contact", "Sinking", "soft_body_rests_on_a_plane", "sinks"),
     ],
 )
