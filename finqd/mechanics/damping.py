@@ -1,4 +1,4 @@
-r"""Rayleigh damping of soft bodies, made only for materials that have it.
+r"""Rayleigh damping of soft bodies (rayleighMass and rayleighStiffness in SOFA), made only for materials that have it.
 
 By the mass (alpha): the force -alpha m v on every vertex, m the material's own mass. By the stiffness (beta):
 Kelvin-Voigt, the stress beta C : (rate of strain), with the strain rate of each element in its own rotating frame: with
