@@ -21,7 +21,8 @@ from finqd.units import MM
 
 RUBBER = Material(youngs_modulus=1e6, poisson_ratio=0.45, density=1000.0)
 SIZE = np.array([20.0, 20.0, 10.0]) * MM
-DEPTH = 0.1 * MM  # how deep bodies overlap
+DEPTH = 0.1 * MM  # how deep bodies overlap,
+DEPTHS = {"steep side of a brick in soft": 2.5 * MM}  # but for these
 
 SPHERE = {"kind": "sphere", "diameter_mm": 40}
 CYLINDER = {"kind": "revolution", "profile_mm": [[0, -20], [18, -20], [18, 20], [0, 20]]}
@@ -39,6 +40,7 @@ CASES: dict[str, tuple[dict[str, Any], tuple[float, float, float], str | None]] 
     "rim of a cylinder on soft": (CYLINDER, (0.6, 0.1, 0.0), "tet4"),
     "corner of a tetrahedron on soft": (TETRAHEDRON, (0.05, -0.08, 0.2), "hex8"),
     "edge of a brick on soft": (BRICK, (0.7, 0.0, 0.3), "wedge6"),
+    "steep side of a brick in soft": (BRICK, (1.33, 0.0, 0.3), "hex8"),
     "ball on a plane": (SPHERE, (0.3, 0.2, 0.1), None),
     "brick on a plane": (BRICK, (0.002, -0.003, 0.1), None),
 }
@@ -61,7 +63,7 @@ def make(case: str, *, friction: float = 0.6) -> System:
     if lowest > -rigid.ball_radius and case.startswith(("rim", "corner", "edge")):
         deepest = (rigid.vertices @ rotation.T)[np.argmin((rigid.vertices @ rotation.T)[:, 2])]
         middle = middle - (deepest[0], deepest[1], 0.0)
-    scene.add_rigid(rigid, position=(middle[0], middle[1], top - lowest - DEPTH), rotation=rotation)
+    scene.add_rigid(rigid, position=(middle[0], middle[1], top - lowest - DEPTHS.get(case, DEPTH)), rotation=rotation)
     return System(scene, contact=Penalty())
 
 
@@ -140,6 +142,16 @@ def test_gradient_is_that_of_the_energy(case: str) -> None:
         slope = np.vdot(soft, move.soft) + np.vdot(rigid, move.rigid)
         assert abs(slope) > 0.0
         assert change / (2 * h) == pytest.approx(slope, rel=1e-5)
+
+
+def test_a_side_that_half_looks_away_is_among_the_cases() -> None:
+    """There the share of the stiffness depends on the normal, and must not change while the body turns."""
+    system = make("steep side of a brick in soft")
+    state = contacting(system)
+    system.contact.energy(state)
+    rows = system.contact.rows
+    cosine = -rows.normal[: rows.count] @ (0.0, 0.0, 1.0)
+    assert np.any((cosine > 0.1) & (cosine < 0.3) & (rows.turns[: rows.count] == 1))
 
 
 def test_hessian_is_that_of_the_gradient(case: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from finqd.mechanics import contact_feature_kernels as features
 from finqd.mechanics import contact_force_kernels as force_kernels
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal, hold, largest_force
@@ -120,7 +121,7 @@ def test_closest_point_of_a_triangle_beats_all_others() -> None:
     regions = set()
     for _ in range(100):
         corners, p, bary = rng.normal(size=(3, 3)), 1.5 * rng.normal(size=3), np.empty(3)
-        kernels.closest_on_triangle(p, *corners, bary)
+        features.closest_on_triangle(p, *corners, bary)
         assert np.isclose(bary.sum(), 1.0, atol=1e-12) and bary.min() >= -1e-12
         distance = np.linalg.norm(p - bary @ corners)
         brute = np.linalg.norm(p - weights @ corners, axis=1)
@@ -138,7 +139,7 @@ def test_near_triangles_misses_none() -> None:
     points = rng.uniform(size=(80, 3))
     pairs = np.empty((5000, 2), dtype=np.int64)
     weight = np.tile(np.eye(3), (20, 1, 1))
-    count = kernels.near_triangles(
+    count = features.near_triangles(
         positions, faces, np.arange(20), points, reach, np.empty((20, 3)), np.empty((20, 3)), pairs
     )
     found = {(int(q), int(t)) for q, t in pairs[:count]}
@@ -148,12 +149,12 @@ def test_near_triangles_misses_none() -> None:
         for t in range(20):
             bary = np.empty(3)
             corners = weight[t] @ positions[faces[t]]
-            kernels.closest_on_triangle(p, *corners, bary)
+            features.closest_on_triangle(p, *corners, bary)
             if np.linalg.norm(p - bary @ corners) < reach:
                 expected.add((q, t))
     assert expected and expected <= found
     small = np.empty((1, 2), dtype=np.int64)
-    assert count == kernels.near_triangles(
+    assert count == features.near_triangles(
         positions, faces, np.arange(20), points, reach, np.empty((20, 3)), np.empty((20, 3)), small
     )
 
@@ -320,7 +321,7 @@ def planes_in_a_dent(rise: float, kept: np.ndarray) -> int:
     positions = np.array([(0, 0, 0), (mm, 0, 0), (mm, mm, 0), (0.3 * mm, 1.5 * mm, rise)])
     faces = np.array([(0, 1, 2), (0, 2, 3)])
     room = 8
-    return kernels.pair_features(
+    return features.pair_features(
         positions, faces, np.arange(2), np.tile(np.eye(3), (2, 1, 1)), np.array([(0, 0), (0, 1)]),
         np.array([(0.55 * mm, 0.5 * mm, 1e-6)]), np.array([(0.0, 0.0, -1.0)]), np.zeros(3), np.eye(3), mm, mm, mm, kept,
         np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64), np.empty((room, 3)), np.empty((room, 3)),
@@ -329,7 +330,7 @@ def planes_in_a_dent(rise: float, kept: np.ndarray) -> int:
 
 
 def test_the_side_of_a_shallow_dent_stays_for_the_step_it_came_in() -> None:
-    threshold = 3.0 * kernels.RISE * 1e-3  # the triangle's middle rises by a third
+    threshold = 3.0 * features.RISE * 1e-3  # the triangle's middle rises by a third
     fresh = np.zeros(2, dtype=bool)
     assert planes_in_a_dent(0.9 * threshold, fresh) == 1 and fresh.tolist() == [True, False]
     assert planes_in_a_dent(1.1 * threshold, fresh) == 2 and fresh.all()
@@ -347,7 +348,7 @@ def test_the_far_side_of_a_ridge_is_no_side_of_a_dent() -> None:
 
     def planes(third: list[tuple[float, float, float]]) -> np.ndarray:
         normal, room = np.empty((8, 3)), 8
-        count = kernels.pair_features(
+        count = features.pair_features(
             np.array(floor + third), faces, np.arange(3), np.tile(np.eye(3), (3, 1, 1)),
             np.array([(0, 0), (0, 1), (0, 2)]), np.array([(0.9 * mm, 0.5 * mm, 2e-6)]), np.array([(0.0, 0.0, -1.0)]),
             np.zeros(3), np.eye(3), mm, mm, mm, np.zeros(3, dtype=bool), np.empty(room, dtype=np.int64),

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Gt, Le
 
+from finqd.mechanics import contact_feature_kernels as features
 from finqd.mechanics import contact_force_kernels as forces
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.contact_rows import FeaturePlanes, FrictionRows, Rows
@@ -87,7 +88,8 @@ class PenaltyContact:
         self.friction = FrictionRows.empty(self.surface.faces.shape[1])
         self.slips = np.zeros((self.n_keys, 3))
         self.bounds = np.zeros(self.n_keys)  # lagged mu N of each key [N]
-        self.facing = np.zeros((len(self.surface.faces), 3))
+        self.facing = np.zeros((len(self.surface.faces), 3))  # unit normals of the faces at the start of the step
+        self.facing_bodies: list[np.ndarray] = []  # the same in the frame of each rigid body
         self.shares = self.fresh_shares = np.full(self.n_keys, np.nan)
         self.planes: list[list[FeaturePlanes]] = []
         self.soft_forces = np.zeros(len(scene.soft_bodies))
@@ -139,6 +141,7 @@ class PenaltyContact:
         self.fresh_shares = np.full(self.n_keys, np.nan)
         self._forget_dents()
         kernels.face_normals(state.positions, self.surface.faces, self.surface.face_corners, self.facing)
+        self.facing_bodies = [self.facing @ rotation for rotation in state.rigid_rotations]
         self._missing = None
         self.relag(state, whole=True)
 
@@ -317,18 +320,16 @@ class PenaltyContact:
         if self.last_rows_state is state:
             return
         rows, surface, scene = self.rows, self.surface, self.scene
-        samples = (
-            surface.faces, self.facing, surface.first_sample, surface.sample_weight, self.sample_stiffness
-        )
+        samples = (surface.first_sample, surface.sample_weight, self.sample_stiffness)
         rows.count = 0
         for r, body in enumerate(scene.rigid_bodies):
             pose = (np.ascontiguousarray(state.rigid_positions[r]), np.ascontiguousarray(state.rigid_rotations[r]))
             rows.count = kernels.find_soft_rigid(
-                state.positions, *samples, *pose, body.shape.distance, *self.boxes[r],
-                float(body.shape.bounding_radius), r, self.first_key["rigid", r], *rows.arrays, rows.count,
+                state.positions, surface.faces, self.facing_bodies[r], *samples, *pose, body.shape.distance,
+                *self.boxes[r], float(body.shape.bounding_radius), r, self.first_key["rigid", r], *rows.arrays, rows.count,
             )
             for b, planes in enumerate(self.planes[r]):
-                rows.count = kernels.find_feature_plane(
+                rows.count = features.find_feature_plane(
                     state.positions, surface.faces, planes.point, planes.face, planes.weight, planes.normal,
                     planes.stiffness, body.shape.feature_points, *pose, r, self.first_key["feature", r, b],
                     *rows.arrays, rows.count,
@@ -340,8 +341,8 @@ class PenaltyContact:
                 )
         for p, plane in enumerate(scene.planes):
             rows.count = kernels.find_soft_plane(
-                state.positions, *samples, plane.point, plane.normal, self.first_key["plane", p], *rows.arrays,
-                rows.count,
+                state.positions, surface.faces, self.facing, *samples, plane.point, plane.normal,
+                self.first_key["plane", p], *rows.arrays, rows.count,
             )
         self.last_rows_state = state
 
@@ -359,7 +360,7 @@ class PenaltyContact:
         n = PLANES * len(shape.feature_points)
         point, face, share = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n)
         weight, normal = np.empty((n, surface.faces.shape[1])), np.empty((n, 3))
-        count = kernels.pair_features(
+        count = features.pair_features(
             state.positions, surface.faces, surface.triangle_face, surface.triangle_weight, pairs,
             shape.feature_points,
             self.feature_normals[r], np.ascontiguousarray(state.rigid_positions[r]),
@@ -403,7 +404,7 @@ class PenaltyContact:
         scratch = np.empty((2, len(surface.faces), 3))
         pairs = np.empty((4096, 2), dtype=np.int64)
         while True:
-            count = kernels.near_triangles(
+            count = features.near_triangles(
                 state.positions, surface.faces, surface.triangle_face, points, FEATURE_REACH, scratch[0], scratch[1],
                 pairs,
             )
