@@ -326,7 +326,8 @@ class PenaltyContact:
             pose = (np.ascontiguousarray(state.rigid_positions[r]), np.ascontiguousarray(state.rigid_rotations[r]))
             rows.count = kernels.find_soft_rigid(
                 state.positions, surface.faces, self.facing_bodies[r], *samples, *pose, body.shape.distance,
-                *self.boxes[r], float(body.shape.bounding_radius), r, self.first_key["rigid", r], *rows.arrays, rows.count,
+                *self.boxes[r], float(body.shape.bounding_radius), r, self.first_key["rigid", r], *rows.arrays,
+                rows.count,
             )
             for b, planes in enumerate(self.planes[r]):
                 rows.count = features.find_feature_plane(
