@@ -1,0 +1,85 @@
+"""When a step may end although what contact lags, friction bounds and geometry, has moved on: scripted renewals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from finqd.mechanics import newton
+from finqd.mechanics.newton import Newton, NewtonOptions
+from finqd.mechanics.state import StepReport
+
+HEAVY, LIGHT = 5.0, 0.5 * newton.LAG_FORCE  # [N] contact force
+
+
+class Scripted(Newton):
+    """Newton's method on a problem that one iteration solves, until the next renewal leaves what a script says."""
+
+    def _iterate(self, trial: Any, energy: float) -> Any:
+        self.system.left = 0.0
+        return trial
+
+
+def run(left: Sequence[float], changes: Sequence[float], *, force: float = HEAVY) -> StepReport:
+    """Return the report of a step whose k-th renewal leaves ``left[k]`` [N], and ``changes[k]`` of the bounds off.
+
+    Beyond the scripts' ends the last entries go on.
+    """
+    renewals = 0
+
+    def relag(trial: Any) -> float:
+        nonlocal renewals
+        k = renewals
+        renewals += 1
+        system.left = left[min(k, len(left) - 1)]
+        return changes[min(k, len(changes) - 1)]
+
+    contact = SimpleNamespace(relag=relag, strain=lambda trial: 0.0, relagged_forces=np.array([force]))
+    system = SimpleNamespace(left=1.0, contact=contact, residual=lambda: (system.left, "the script"))
+    increment = SimpleNamespace(gradient=lambda trial: 0.0)
+    report = StepReport(residuals=[])
+    Scripted(system=system, increment=increment, options=NewtonOptions(), report=report).minimise(object())
+    return report
+
+
+def test_a_step_ends_where_renewing_leaves_nothing() -> None:
+    report = run([1.0, 0.1, 0.0], [0.5, 0.1, 0.0])
+    assert report.converged and report.residual == 0.0 and report.friction_updates == 3
+
+
+def test_bounds_far_from_coulombs_law_end_no_step() -> None:
+    """They swing by more than `LAG_CHANGE` for ever, though little is left unbalanced."""
+    little = 0.5 * newton.LAG_FORCE
+    report = run([little], [1.2 * newton.LAG_CHANGE])
+    assert not report.converged and "friction did not come to rest" in report.reason
+    assert run([little], [0.8 * newton.LAG_CHANGE]).converged
+
+
+def test_where_contact_is_light_the_bounds_do_not_matter() -> None:
+    assert run([0.5 * LIGHT], [1.0], force=LIGHT).converged
+    assert not run([0.5 * LIGHT], [1.0], force=HEAVY).converged
+
+
+def test_renewals_that_still_converge_are_granted_more() -> None:
+    options, bound = NewtonOptions(), newton.LAG_SHARE * HEAVY
+    rate = 0.8
+    needed = 2 * options.max_friction_updates
+    slowly = [bound * rate ** (k - needed) for k in range(needed + 3)]
+    report = run([*slowly[: needed + 2], 0.0], [0.1])
+    assert report.converged and report.friction_updates >= needed
+
+
+def test_patience_ends() -> None:
+    most = NewtonOptions().max_friction_updates * newton.PATIENCE
+    report = run([10.0 * 0.99**k for k in range(10 * most)], [0.1])
+    assert not report.converged and "contact moved on too fast" in report.reason
+    assert most <= report.friction_updates <= most + 2
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_what_may_stay_unbalanced_is_a_share_of_the_contact_force(share: float) -> None:
+    assert run([share * newton.LAG_SHARE * HEAVY], [0.1]).converged == (share < 1.0)
