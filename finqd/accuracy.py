@@ -168,6 +168,8 @@ class Study:
         """A hash of all that the exact values depend on: nothing of how they are computed."""
         resolved = self.design.with_overrides(self.case.overrides).resolved()
         known: dict[str, Any] = {key: resolved.get(key) for key in self.case.physics}
+        # a constant of zero is left out: what a later version adds to the material, and is off, changes no value
+        known["material"] = {key: value for key, value in known["material"].items() if value != 0}
         if "protocol" in known:
             skipped = ("time_step_ms", "wall_clock_limit_s")
             known["protocol"] = {k: v for k, v in known["protocol"].items() if k not in skipped}

@@ -328,7 +328,11 @@ def test_a_reference_reads_back_and_fits_only_its_own_physics(study_in, tmp_path
         return other.physics
 
     assert physics() == physics(**{"mesher.size_mm": 1, "protocol.time_step_ms": 2, "spacing_mm": 35}) == study.physics
-    assert study.physics not in (physics(**{"material.youngs_modulus_MPa": 3}), physics(**{"finger.rib_count": 4}))
+    assert physics(**{"material.rayleigh_stiffness_ms": 0}) == study.physics
+    assert study.physics not in (
+        physics(**{"material.youngs_modulus_MPa": 3}), physics(**{"finger.rib_count": 4}),
+        physics(**{"material.rayleigh_stiffness_ms": 1}),
+    )
     fresh = study_in(tmp_path / "elsewhere")
     fresh.set_reference("auto")
     assert fresh.runner.ran == [] and fresh.reference.source == "shipped" and fresh.reference_rungs() == ()
