@@ -152,7 +152,8 @@ def rod_impact(divisions: int = 100, *, steps: int = 100, stepper: str = "bdf2")
 
     One-dimensional waves (Saint-Venant): the plane feels rho c v A for 2 L/c, then the rod leaves with its speed
     reversed. ``steps``: time steps in 2 L/c. Both are taken from the rod's momentum, since a penalty's force chatters
-    where it is not implicit; the plateau is the mean over its middle half.
+    where it is not implicit; the plateau is the slope of the line fitted to its middle half, as chatter at two instants
+    alone would be worth 3 %.
     """
     speed = np.sqrt(ROD.youngs_modulus / ROD.density)
     contact_time = 2.0 * ROD_LENGTH / speed
@@ -168,8 +169,8 @@ def rod_impact(divisions: int = 100, *, steps: int = 100, stepper: str = "bdf2")
         watch=lambda system, state: momenta.append((state.time, float(system.masses @ state.velocities[:, 2]))),
     ))
     times, momentum = np.array(momenta).T
-    early, late = np.interp([0.25 * contact_time, 0.75 * contact_time], times, momentum)
-    plateau = (late - early) / (0.5 * contact_time)
+    middle = np.abs(times / contact_time - 0.5) <= 0.25
+    plateau = np.polyfit(times[middle], momentum[middle], 1)[0]
     area, mass = ROD_SIDE**2, ROD.density * ROD_SIDE**2 * ROD_LENGTH
     impulse = float(momentum[-1] - momentum[0]) / (2.0 * mass * ROD_SPEED)
     return float(plateau / (ROD.density * speed * ROD_SPEED * area)), impulse
