@@ -30,7 +30,7 @@ COUPLING = 0.5  # largest W2 - W3 over W2 that a projected Hessian keeps [-] (`_
 
 
 @njit(cache=True)
-def _strained(e, nodes, rest, gradients, positions, r, s, y, u):
+def strained(e, nodes, rest, gradients, positions, r, s, y, u):
     """Write R (3, 3), S (3, 3), y (3k,) and u (3k,) [m] of element e."""
     k = nodes.shape[1]
     cx, cy, cz = 0.0, 0.0, 0.0
@@ -162,7 +162,7 @@ def energy(nodes, rest, gradients, stiffness, positions):
     r, s, y, u, f = np.empty((3, 3)), np.empty((3, 3)), np.empty(m), np.empty(m), np.empty(m)
     total = 0.0
     for e in range(nodes.shape[0]):
-        _strained(e, nodes, rest, gradients, positions, r, s, y, u)
+        strained(e, nodes, rest, gradients, positions, r, s, y, u)
         _times(stiffness, e, u, f)
         total += _half_dot(u, f)
     return total
@@ -176,7 +176,7 @@ def add_gradient(nodes, rest, gradients, stiffness, positions, gradient):
     y, u, f, q, h = np.empty(3 * k), np.empty(3 * k), np.empty(3 * k), np.empty(3 * k), np.empty(3)
     total = 0.0
     for e in range(nodes.shape[0]):
-        _strained(e, nodes, rest, gradients, positions, r, s, y, u)
+        strained(e, nodes, rest, gradients, positions, r, s, y, u)
         _times(stiffness, e, u, f)
         total += _half_dot(u, f)
         _inverse_spin(s, g, gi)
@@ -385,7 +385,7 @@ def add_hessian(nodes, rest, gradients, stiffness, compliance, positions, slots,
     omega, columns, kc = np.empty((3, m)), np.empty((3, m)), np.empty((3, m))
     q_columns, b, rows, turned = np.empty((3, m)), np.empty((3, m)), np.empty((3, m)), np.empty((3, m))
     for e in range(nodes.shape[0]):
-        _strained(e, nodes, rest, gradients, positions, r, s, y, u)
+        strained(e, nodes, rest, gradients, positions, r, s, y, u)
         _times(stiffness, e, u, f)
         regular = _inverse_spin(s, g, gi)
         _force(e, gradients, y, f, gi, h, q)

@@ -30,7 +30,7 @@ import numpy as np
 from finqd.errors import InputError
 from finqd.mechanics import corotated_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal
-from finqd.mechanics.damping_kernels import add_local_shapes
+from finqd.mechanics.damping_kernels import write_local_shapes
 from finqd.mechanics.element_stiffness import rest_elements
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class ViscousBlock:
     def shapes(self, positions: np.ndarray) -> np.ndarray:
         """Return y [m], (n, k, 3), of all elements at ``positions`` (n_vertices, 3) [m]."""
         shapes = np.zeros(self.gradients.shape)
-        add_local_shapes(self.nodes, self.gradients, positions, 1.0, shapes)
+        write_local_shapes(self.nodes, self.gradients, positions, shapes)
         return shapes
 
 
