@@ -197,7 +197,7 @@ def expected_seconds(case: Case, design: Design) -> float:
     slow = {"explicit": 300.0, "imex": 0.4, "quasi_static": 1.2}.get(stepper["name"], 1.0)
     slow *= {"jacobi": 12.0, "block_jacobi": 8.0}.get(stepper.get("preconditioner", ""), 1.0)
     slow *= {"superlu": 3.0, "cholmod": 1.5, "qdldl": 1.5}.get(stepper.get("backend", ""), 1.0)
-    slow *= (1.5 / getattr(contact, "sample_spacing_mm", 1.5)) ** 0.5
+    slow *= (0.3 / getattr(contact, "sample_spacing_mm", 0.3)) ** 0.5
     steps = case.simulated_s(design) / step * case.fingers
     return 0.3 + steps * weight * slow * 9e-6 * dofs * (dofs / 2800.0) ** 0.15
 

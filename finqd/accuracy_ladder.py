@@ -231,7 +231,8 @@ def _linear() -> list[Rung]:
 
 def _contacts() -> list[Rung]:
     options = {
-        "stiffness_N_mm3": (10, 30, 100, 300, 1000, 3000), "sample_spacing_mm": (6, 3, 1.5, 0.75),
+        "stiffness_N_mm3": (10, 30, 100, 300, 1000, 3000), "sample_spacing_mm": (1.2, 0.6, 0.3, 0.15),
+        "edge_radius_mm": (0.125, 0.25, 0.5, 1),
         "smoothing_mm": (0.1, 0.03, 0.01, 0.003), "friction_stiffness_ratio": (0.1, 0.5, 2),
     }
     return [

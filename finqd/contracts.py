@@ -159,9 +159,6 @@ class ContactPotential(Protocol):
     def step_limit(self, state: State, direction: Direction) -> float:
         """Return the largest share (0, 1] of ``direction`` in which no contact can tunnel through."""
 
-    def strain(self, state: State) -> float:
-        """Return how far what is lagged has been left behind at ``state``; above 1, the step has to be shorter."""
-
     def commit(self, state: State) -> None:
         """Accept ``state`` as the end of the step: return mapping of the elastic slip, forces, penetrations."""
 

@@ -17,7 +17,6 @@ from finqd.errors import InputError
 from finqd.mechanics.distance import revolution_field, sphere_field, surface_field, triangle_neighbours
 from finqd.mechanics.distance_kernels import DistanceField
 from finqd.mechanics.mass_properties import ball_moments, revolution_moments, surface_moments
-from finqd.object_features import revolution_features, surface_features
 from finqd.options import checked, join, refuse_unknown, require_object, shown
 from finqd.units import MM
 
@@ -35,8 +34,8 @@ class Shape:
     """A solid with its centre of mass in the origin.
 
     volume [m^3]; inertia (3, 3): of density 1, about the origin [m^5]; vertices (n, 3) [m] and triangles (m, 3): its
-    surface, watertight and outward; distance; feature_points (k, 3), feature_lengths (k,) [m]; profile (r, z) [m] of a
-    solid of revolution or None; ball_radius: 0 unless it is a ball [m].
+    surface, watertight and outward; distance; profile (r, z) [m] of a solid of revolution or None; ball_radius: 0
+    unless it is a ball [m].
     """
 
     volume: float
@@ -44,8 +43,6 @@ class Shape:
     vertices: np.ndarray
     triangles: np.ndarray
     distance: DistanceField
-    feature_points: np.ndarray
-    feature_lengths: np.ndarray
     profile: np.ndarray | None = None
     ball_radius: float = 0.0
 
@@ -72,9 +69,8 @@ def ball(radius: float) -> Shape:
     profile = radius * np.column_stack([np.cos(angles), np.sin(angles)])
     profile[[0, -1], 0] = 0.0
     moments = ball_moments(radius)
-    nothing = np.zeros((0, 3)), np.zeros(0)
     surface = turned_surface(profile, n_around=AROUND)
-    return Shape(moments.volume, moments.inertia, *surface, sphere_field(radius), *nothing, ball_radius=radius)
+    return Shape(moments.volume, moments.inertia, *surface, sphere_field(radius), ball_radius=radius)
 
 
 def solid_of_revolution(profile: np.ndarray) -> Shape:
@@ -86,7 +82,6 @@ def solid_of_revolution(profile: np.ndarray) -> Shape:
         moments.inertia,
         *turned_surface(profile, n_around=AROUND),
         revolution_field(profile),
-        *revolution_features(profile),
         profile=profile,
     )
 
@@ -102,7 +97,6 @@ def solid_in_surface(vertices: np.ndarray, triangles: np.ndarray) -> Shape:
         vertices,
         triangles,
         surface_field(vertices, triangles, topology=topology),
-        *surface_features(vertices, triangles, topology),
     )
 
 

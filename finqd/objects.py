@@ -27,7 +27,7 @@ from finqd.data import bundled_names, objects_folder
 from finqd.errors import InputError
 from finqd.json_input import read_json_object
 from finqd.mechanics.distance_kernels import DistanceField
-from finqd.object_features import rest_pose, revolution_supports, surface_supports
+from finqd.object_rest import rest_pose, revolution_supports, surface_supports
 from finqd.object_shapes import KINDS, Shape, refuse_size, shape_from_json, solid_in_surface
 from finqd.options import checked, join, nearest, refuse_unknown, shown
 from finqd.surface_files import SUFFIXES, read_surface
@@ -49,8 +49,7 @@ class GraspObject:
     name; mass [kg]; inertia (3, 3) [kg m^2]: about the centre of mass, in the body frame;
     vertices (n, 3) [m], triangles (m, 3): watertight outward surface in the body frame (a tessellation, if curved);
     distance: `DistanceField` in the body frame (exact: a ball and a solid of revolution are not tessellated);
-    feature_points (k, 3), feature_lengths (k,) [m]: samples of sharp convex edges, about 1 mm apart, with the length
-    that each stands for, and sharp vertices with length 0;
+    profile (n, 2) [m]: (r, z) of a solid of revolution about z, else None;
     support_points (s, 3) [m]: what can touch a plane; empty for a ball;
     rest_rotation (3, 3), rest_height [m]: body to world rotation, and height of the centre of mass, that rest on z = 0;
     ball_radius [m]: above 0 only for a ball; bounding_radius [m]: about the centre of mass;
@@ -63,8 +62,7 @@ class GraspObject:
     vertices: np.ndarray
     triangles: np.ndarray
     distance: DistanceField
-    feature_points: np.ndarray
-    feature_lengths: np.ndarray
+    profile: np.ndarray | None
     support_points: np.ndarray
     rest_rotation: np.ndarray
     rest_height: float
@@ -191,8 +189,7 @@ def _placed(
         vertices=shape.vertices,
         triangles=shape.triangles,
         distance=shape.distance,
-        feature_points=shape.feature_points,
-        feature_lengths=shape.feature_lengths,
+        profile=shape.profile,
         support_points=supports,
         rest_rotation=rotation,
         rest_height=height,

@@ -5,20 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finqd.mechanics import contact_feature_kernels as features
 from finqd.mechanics import contact_force_kernels as force_kernels
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal, hold, largest_force
+from finqd.mechanics.contact_rows import KeyedValues, Rows
 from finqd.mechanics.contact_surface import contact_shape, contact_surface, lattice
+from finqd.mechanics.distance_kernels import signed_distance
 from finqd.mechanics.elements import face_shape
 from finqd.mechanics.material import Material
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_matrix, rotation_vector, skew
+from finqd.mechanics.rounding import rounded_field
 from finqd.mesh_shapes import box_mesh
+from finqd.objects import load_object
 from finqd.scene import Scene
 
 pytestmark = pytest.mark.kernel
 
+RUBBER = Material(youngs_modulus=1e6, poisson_ratio=0.45, density=1000.0)
 STIFFNESS, SMOOTHING = 2e5, 1e-5  # [N/m], [m]
 
 
@@ -52,14 +56,6 @@ def test_normal_penalty_is_smooth_where_its_pieces_meet() -> None:
     deep = 1e-3
     force, _ = force_kernels.normal_force(-deep, STIFFNESS, SMOOTHING)
     assert force == pytest.approx(STIFFNESS * (deep - SMOOTHING / 2), rel=1e-12)
-
-
-def test_sides_that_look_away_do_not_push() -> None:
-    cosines = np.linspace(-1, 1, 2001)
-    shares = np.array([kernels.opposition(c) for c in cosines])
-    assert np.all(shares[cosines <= kernels.OPPOSED] == 0.0)
-    assert np.all(shares[cosines >= kernels.FULLY_OPPOSED] == 1.0)
-    assert np.all(np.diff(shares) >= 0.0) and np.diff(shares).max() < 0.01
 
 
 # -- friction ----------------------------------------------------------------------------------------------------------
@@ -114,51 +110,6 @@ def test_a_ball_that_rolls_does_not_slip() -> None:
 # -- geometry ----------------------------------------------------------------------------------------------------------
 
 
-def test_closest_point_of_a_triangle_beats_all_others() -> None:
-    rng = np.random.default_rng(3)
-    grid = np.array([(i, j) for i in range(41) for j in range(41 - i)]) / 40
-    weights = np.column_stack([1 - grid.sum(axis=1), grid])
-    regions = set()
-    for _ in range(100):
-        corners, p, bary = rng.normal(size=(3, 3)), 1.5 * rng.normal(size=3), np.empty(3)
-        features.closest_on_triangle(p, *corners, bary)
-        assert np.isclose(bary.sum(), 1.0, atol=1e-12) and bary.min() >= -1e-12
-        distance = np.linalg.norm(p - bary @ corners)
-        brute = np.linalg.norm(p - weights @ corners, axis=1)
-        assert distance <= brute.min() + 1e-12
-        assert brute.min() - distance < 0.15  # on that grid something is near
-        regions.add(tuple(bary > 1e-12))
-    assert len(regions) == 7  # three corners, three edges, the inside
-
-
-def test_near_triangles_misses_none() -> None:
-    rng = np.random.default_rng(4)
-    positions, reach = rng.uniform(size=(60, 3)), 0.05
-    faces = rng.permutation(60).reshape(20, 3)
-    positions[faces[:, 1:]] = positions[faces[:, :1]] + 0.1 * rng.normal(size=(20, 2, 3))
-    points = rng.uniform(size=(80, 3))
-    pairs = np.empty((5000, 2), dtype=np.int64)
-    weight = np.tile(np.eye(3), (20, 1, 1))
-    count = features.near_triangles(
-        positions, faces, np.arange(20), points, reach, np.empty((20, 3)), np.empty((20, 3)), pairs
-    )
-    found = {(int(q), int(t)) for q, t in pairs[:count]}
-    assert len(found) == count <= len(pairs)
-    expected = set()
-    for q, p in enumerate(points):
-        for t in range(20):
-            bary = np.empty(3)
-            corners = weight[t] @ positions[faces[t]]
-            features.closest_on_triangle(p, *corners, bary)
-            if np.linalg.norm(p - bary @ corners) < reach:
-                expected.add((q, t))
-    assert expected and expected <= found
-    small = np.empty((1, 2), dtype=np.int64)
-    assert count == features.near_triangles(
-        positions, faces, np.arange(20), points, reach, np.empty((20, 3)), np.empty((20, 3)), small
-    )
-
-
 def test_plane_step_limit_stops_at_the_allowance() -> None:
     heights, approach = np.array([1e-3, 5e-3, -1e-4]), np.array([2e-3, 1e-3, -1.0])
     limit = kernels.plane_step_limit(heights, approach, 5e-4)
@@ -169,30 +120,98 @@ def test_plane_step_limit_stops_at_the_allowance() -> None:
 
 @pytest.mark.parametrize("kind", ["quad4", "quad8", "tri3", "tri6"])
 @pytest.mark.parametrize("cells", [(1, 1), (3, 2), (4, 5)])
-def test_lattice_covers_a_face_and_its_edges(kind: str, cells: tuple[int, int]) -> None:
+def test_lattice_covers_a_face_evenly(kind: str, cells: tuple[int, int]) -> None:
     points, share = lattice(kind, *cells)
     assert len(points) == len(share) and np.all(share > 0.0)
     assert share.sum() == pytest.approx(1.0, abs=1e-14)
     if kind.startswith("quad"):
-        corners, centroid = [(-1, -1), (1, -1), (1, 1), (-1, 1)], (0.0, 0.0)
+        n, m = cells
+        assert len(points) == n * m and np.all(np.abs(points) < 1.0)
+        assert np.ptp(points, axis=0) == pytest.approx((2 - 2 / n, 2 - 2 / m))
+        centroid = (0.0, 0.0)
     else:
-        corners, centroid = [(0, 0), (1, 0), (0, 1)], (1 / 3, 1 / 3)
-    for corner in corners:
-        assert np.min(np.linalg.norm(points - corner, axis=1)) < 1e-14
+        assert len(points) == cells[0] ** 2 and points.min() > 0.0 and points.sum(axis=1).max() < 1.0
+        centroid = (1 / 3, 1 / 3)
     assert np.allclose(share @ points, centroid, atol=1e-14)  # linear pressures are integrated exactly
 
 
 def test_samples_stand_for_the_whole_surface_once() -> None:
     for element in ("hex8", "wedge6", "tet4", "tet10"):
         scene = Scene()
-        rubber = Material(youngs_modulus=1e6, poisson_ratio=0.45, density=1000.0)
-        body = scene.add_soft(box_mesh((0.02, 0.03, 0.01), (2, 3, 1), element), rubber)
+        body = scene.add_soft(box_mesh((0.02, 0.03, 0.01), (2, 3, 1), element), RUBBER)
         body.fix("xmin")
         surface = contact_surface(scene.soft_bodies, spacing=1.5e-3)
         area = 2 * (0.02 * 0.03 + 0.02 * 0.01 + 0.03 * 0.01) - 0.03 * 0.01  # without the face that is held
-        assert surface.sample_area.sum() == pytest.approx(area, rel=1e-12)
-        assert np.allclose(surface.sample_weight.sum(axis=1), 1.0)
-        assert np.allclose(surface.triangle_weight.sum(axis=2), 1.0)
+        lattices = [slice(*ends) for ends in zip(surface.lattice_first, surface.lattice_first[1:])]
+        shares = [surface.lattice_share[lattices[k]].sum() for k in surface.face_lattice]
+        assert surface.face_area @ shares == pytest.approx(area, rel=1e-12)
+        assert np.allclose(surface.lattice_weight.sum(axis=1), 1.0)
+        counts = [lattices[k].stop - lattices[k].start for k in surface.face_lattice]
+        assert np.array_equal(np.diff(surface.first_sample), counts) and surface.n_samples == sum(counts)
+
+
+def test_only_samples_inside_a_body_are_found_and_all_of_them() -> None:
+    scene = Scene()
+    body = scene.add_soft(box_mesh((0.02, 0.03, 0.01), (3, 4, 2), "hex8"), RUBBER)
+    surface = contact_surface(scene.soft_bodies, spacing=0.4e-3)
+    positions = body.mesh.vertices + 2e-4 * np.random.default_rng(8).normal(size=body.mesh.vertices.shape)
+    brick = load_object({"shape": {"kind": "box", "size_mm": [9, 7, 5]}, "mass_g": 5})
+    field = rounded_field(brick, 0.5e-3)
+    centre, rotation = np.array([0.009, 0.014, 0.0125]), rotation_matrix(np.array([0.3, -0.2, 0.5]))
+
+    def find(room: int) -> tuple[int, Rows]:
+        rows = Rows(room, surface.faces.shape[1])
+        count = kernels.find_soft_rigid(
+            positions, *surface.arrays, 1e9, centre, rotation, field, brick.bounding_radius, 0, 7, *rows.arrays, 0
+        )
+        return count, rows
+
+    expected = {}
+    for f, face in enumerate(surface.faces):
+        first, last = surface.lattice_first[surface.face_lattice[f] :][:2]
+        for s in range(first, last):
+            x = surface.lattice_weight[s] @ positions[face]
+            d, *_ = signed_distance(field, *(rotation.T @ (x - centre)))
+            if d < 0.0:
+                expected[7 + surface.first_sample[f] + s - first] = d
+    count, rows = find(5000)
+    assert len(expected) == count > 50 and count < surface.n_samples / 4
+    assert dict(zip(rows.key[:count], rows.gap[:count])) == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    few, rows = find(20)  # what there is no room for is counted
+    assert few == count and len(rows.key) == 20
+
+
+def test_soft_step_limit_lets_no_point_pass_the_allowance() -> None:
+    mesh = box_mesh((0.02, 0.02, 0.005), (3, 3, 1), "hex8")
+    ball = load_object({"shape": {"kind": "sphere", "diameter_mm": 10}, "mass_g": 5})
+    scene = Scene()
+    scene.add_soft(mesh, RUBBER)
+    surface = contact_surface(scene.soft_bodies, spacing=0.4e-3)
+    centre, up = np.array([0.009, 0.011, 0.0115]), np.tile([0.0, 0.0, 0.02], (len(mesh.vertices), 1))
+    nothing, limits = np.zeros(3), []
+    for direction, shift in ((up, nothing), (np.zeros_like(up), -up[0])):
+        limits.append(kernels.soft_step_limit(
+            mesh.vertices, direction, surface.faces, centre, np.eye(3), ball.distance, 0.005, shift, nothing, 5e-4
+        ))
+    assert limits[0] == pytest.approx(limits[1], rel=1e-12) and 0.0 < limits[0] < 1.0
+    moved = mesh.vertices + limits[0] * up
+    depths = [
+        -signed_distance(ball.distance, *(surface.lattice_weight[s] @ moved[face] - centre))[0]
+        for f, face in enumerate(surface.faces)
+        for s in range(*surface.lattice_first[surface.face_lattice[f] :][:2])
+    ]
+    assert max(depths) <= 5e-4 + 1e-12
+    small = kernels.soft_step_limit(
+        mesh.vertices, 0.02 * up, surface.faces, centre, np.eye(3), ball.distance, 0.005, nothing, nothing, 5e-4
+    )
+    assert small == 1.0
+
+
+def test_values_are_found_again_by_their_keys() -> None:
+    values = KeyedValues.of(np.array([7, 2, 9]), np.array([0.7, 0.2, 0.9]))
+    assert values.at(np.array([9, 3, 2, 10])).tolist() == [0.9, 0.0, 0.2, 0.0]
+    empty = KeyedValues(keys=np.zeros(0, dtype=np.int64), values=np.zeros((0, 3)))
+    assert np.array_equal(empty.at(np.array([1, 2])), np.zeros((2, 3)))
 
 
 # -- rotations ---------------------------------------------------------------------------------------------------------
@@ -307,59 +326,6 @@ def test_diagonal_and_largest_force() -> None:
     size, where = largest_force(forces, fixed)
     assert np.isnan(size) and where == 3
     assert largest_force(np.zeros((0, 3)), np.zeros((0, 3), dtype=bool))[1] == -1
-
-
-# -- dents -------------------------------------------------------------------------------------------------------------
-
-
-def planes_in_a_dent(rise: float, kept: np.ndarray) -> int:
-    """Return how many planes a point gets just over a strip of two triangles, the other of which rises by ``rise`` [m].
-
-    ``kept`` remembers which pairs have had a plane.
-    """
-    mm = 1e-3
-    positions = np.array([(0, 0, 0), (mm, 0, 0), (mm, mm, 0), (0.3 * mm, 1.5 * mm, rise)])
-    faces = np.array([(0, 1, 2), (0, 2, 3)])
-    room = 8
-    return features.pair_features(
-        positions, faces, np.arange(2), np.tile(np.eye(3), (2, 1, 1)), np.array([(0, 0), (0, 1)]),
-        np.array([(0.55 * mm, 0.5 * mm, 1e-6)]), np.array([(0.0, 0.0, -1.0)]), np.zeros(3), np.eye(3), mm, mm, mm, kept,
-        np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64), np.empty((room, 3)), np.empty((room, 3)),
-        np.empty(room),
-    )
-
-
-def test_the_side_of_a_shallow_dent_stays_for_the_step_it_came_in() -> None:
-    threshold = 3.0 * features.RISE * 1e-3  # the triangle's middle rises by a third
-    fresh = np.zeros(2, dtype=bool)
-    assert planes_in_a_dent(0.9 * threshold, fresh) == 1 and fresh.tolist() == [True, False]
-    assert planes_in_a_dent(1.1 * threshold, fresh) == 2 and fresh.all()
-    assert planes_in_a_dent(0.9 * threshold, fresh) == 2  # it came in, and has not clearly fallen away
-    assert planes_in_a_dent(-0.9 * threshold, fresh) == 2
-    assert planes_in_a_dent(-1.1 * threshold, fresh) == 1
-
-
-def test_the_far_side_of_a_ridge_is_no_side_of_a_dent() -> None:
-    """Two triangles make a floor; a third near by rises over it, first towards the point like a valley's other side,
-    then away from it like the far side of a ridge: extended, its plane then passes over the point."""
-    mm = 1e-3
-    floor = [(0, 0, 0), (mm, 0, 0), (mm, mm, 0), (0, mm, 0)]
-    faces = np.array([(0, 1, 2), (0, 2, 3), (4, 5, 6)])
-
-    def planes(third: list[tuple[float, float, float]]) -> np.ndarray:
-        normal, room = np.empty((8, 3)), 8
-        count = features.pair_features(
-            np.array(floor + third), faces, np.arange(3), np.tile(np.eye(3), (3, 1, 1)),
-            np.array([(0, 0), (0, 1), (0, 2)]), np.array([(0.9 * mm, 0.5 * mm, 2e-6)]), np.array([(0.0, 0.0, -1.0)]),
-            np.zeros(3), np.eye(3), mm, mm, mm, np.zeros(3, dtype=bool), np.empty(room, dtype=np.int64),
-            np.empty(room, dtype=np.int64), np.empty((room, 3)), normal, np.empty(room),
-        )
-        return -normal[:count]
-
-    valley = planes([(mm, 0, 0), (2 * mm, 0.4 * mm, 0.5 * mm), (mm, mm, 0)])
-    assert len(valley) == 2 and valley[0] == pytest.approx([0, 0, 1]) and valley[1][0] < -0.3
-    ridge = planes([(mm, 0, 0.4 * mm), (2 * mm, 0.4 * mm, 0.1 * mm), (mm, mm, 0.4 * mm)])
-    assert ridge == pytest.approx(np.array([[0, 0, 1]]))
 
 
 # -- faces as contact sees them ----------------------------------------------------------------------------------------

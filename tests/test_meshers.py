@@ -25,7 +25,8 @@ from finqd.meshing import close_mesher, mesh_solid
 from finqd.plugins.geometry_fin_ray import FinRay
 from finqd.plugins.mesher_swept import Swept
 from finqd.plugins.mesher_tetrahedral import Tetrahedral
-from finqd.plugins.swept_patches import edge_counts, graded
+from finqd.plugins.swept_patches import PlaneMesh, edge_counts, graded
+from finqd.plugins.swept_paving import cut_into_quads
 from finqd.solid import Prism, Solid, SurfaceSolid
 from finqd.units import DEG, MM
 
@@ -156,9 +157,23 @@ def test_second_order_hexahedra_have_straight_edges_and_the_same_regions() -> No
         assert set(linear.node_sets[name]) < set(mesh.node_sets[name])
     assert np.abs(mesh.vertices[mesh.node_sets["base"], 1]).max() == 0.0
     assert lumped_masses(mesh, 1150.0).min() > 0.0
-    paved = replace(solid, patches=None)
-    with pytest.raises(MeshError, match="triangles, and there are no quadratic wedges"):
-        Swept(order=2).mesh(paved)
+
+
+@pytest.mark.parametrize("quarter", ["middle", "quarter"])
+def test_a_profile_whose_mesh_leaves_triangles_gets_quadratic_hexahedra_too(quarter: str) -> None:
+    paved = replace(FinRay().build(BENCHMARK), patches=None)
+    assert "wedge6" in Swept().mesh(paved).blocks
+    mesh = Swept(order=2, notch_nodes=quarter).mesh(paved)
+    assert set(mesh.blocks) == {"hex20"}
+    assert_good_mesh(mesh, paved, worst=0.08)
+
+
+def test_cutting_into_quadrilaterals_keeps_the_area_and_joins_neighbours() -> None:
+    points = np.array([[0, 0], [2, 0], [2, 1], [0, 1], [3, 0.5]], dtype=float)
+    plane = cut_into_quads(PlaneMesh(points, np.array([[0, 1, 2, 3]]), np.array([[1, 4, 2]])))
+    assert len(plane.quads) == 7 and len(plane.triangles) == 0
+    assert plane.area() == pytest.approx(2.5, rel=1e-14) and plane.worst() > 0.4
+    assert len(plane.points) == 5 + 6 + 2  # corners, middles of edges (one of them shared), centres
 
 
 def test_grading_shrinks_the_edges_at_notches_and_leaves_the_rest_as_it_was() -> None:

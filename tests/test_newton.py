@@ -38,7 +38,7 @@ def run(left: Sequence[float], changes: Sequence[float], *, force: float = HEAVY
         system.left = left[min(k, len(left) - 1)]
         return changes[min(k, len(changes) - 1)]
 
-    contact = SimpleNamespace(relag=relag, strain=lambda trial: 0.0, relagged_forces=np.array([force]))
+    contact = SimpleNamespace(relag=relag, relagged_forces=np.array([force]))
     system = SimpleNamespace(left=1.0, contact=contact, residual=lambda: (system.left, "the script"))
     increment = SimpleNamespace(gradient=lambda trial: 0.0)
     report = StepReport(residuals=[])

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from finqd.errors import InputError
 from finqd.mechanics.distance_kernels import signed_distance, signed_distances
 from finqd.mechanics.mass_properties import surface_moments
-from finqd.object_features import rest_pose, support_facets
+from finqd.object_rest import rest_pose, support_facets
 from finqd.objects import load_object, object_names
 
 MM3 = 1e-9
@@ -123,50 +123,6 @@ def test_the_ten_stand_or_lie_as_decided(ten):
     # set down on its lower tip, the diamond topples by the slope of the lower cone
     assert axis["diamond"] == pytest.approx(np.cos(np.arctan2(26, 22)), abs=2e-3)
     assert "toppled by 49.8 degrees" in ten["diamond"].assumptions[0]
-
-
-def test_sharp_features_of_the_ten(ten):
-    """Total length of convex edges, and number of tips, by hand (mm)."""
-    expected = {
-        "sphere": (0, 0), "cube": (12 * 35, 8), "triangle": (6 * 50, 4), "cylinder": (2 * np.pi * 36, 0),
-        "disk": (2 * np.pi * 50, 0), "flan": (np.pi * (50 + 34), 0), "diablo": (2 * np.pi * 44, 0),
-        "hourglass": (2 * np.pi * 40, 0), "diamond": (np.pi * 44, 2), "pasta": (2 * np.pi * (30 + 20), 0),
-    }  # fmt: skip
-    for name, (length, tips) in expected.items():
-        item = ten[name]
-        assert item.feature_lengths.sum() * 1e3 == pytest.approx(length, rel=1e-6), name
-        assert np.count_nonzero(item.feature_lengths == 0) == tips, name
-        assert len(item.feature_points) == len(item.feature_lengths)
-        assert np.all(item.feature_lengths <= 1e-3 * (1 + 1e-6))
-        for point in item.feature_points[::7]:
-            assert abs(signed_distance(item.distance, *point)[0]) < 1e-12
-
-
-def test_concave_edges_and_smooth_surfaces_are_no_features():
-    import trimesh
-
-    tray = {"kind": "polyhedron", "vertices_mm": [], "faces": []}
-    ring = [[-20, -20], [20, -20], [20, 20], [0, 0], [-20, 20]]  # a notch whose bottom edge is concave
-    tray["vertices_mm"] = [[x, y, z] for z in (-5, 5) for x, y in ring]
-    tray["faces"] = [[1, 0, 3], [0, 4, 3], [1, 3, 2], [5, 6, 8], [5, 8, 9], [6, 7, 8]]
-    tray["faces"] += [[i, (i + 1) % 5, (i + 1) % 5 + 5, i + 5] for i in range(5)]
-    item = load_object({"shape": tray, "mass_g": 10})
-    along_z = np.abs(item.feature_points[:, :2]).max(axis=1) < 0.0199
-    inner = item.feature_points[along_z & (np.abs(item.feature_points[:, 2]) < 0.0049)]
-    assert len(inner) == 0
-    assert np.count_nonzero(item.feature_lengths == 0) == 8
-    smooth = trimesh.creation.icosphere(4, 20)
-    item = load_object({"shape": {"kind": "polyhedron", "vertices_mm": smooth.vertices.tolist()}, "mass_g": 10})
-    assert len(item.feature_points) == 0
-
-
-def test_fine_rims_of_a_file_are_sampled_by_length_not_by_triangle(tmp_path):
-    import trimesh
-
-    path = write(tmp_path, trimesh.creation.cylinder(15, 40, sections=3000), "rod.stl")
-    item = load_object(path, mass_g=20)
-    assert item.feature_lengths.sum() == pytest.approx(2 * np.pi * 0.03, rel=1e-4)
-    assert 180 <= len(item.feature_points) <= 800
 
 
 def test_toppling_takes_the_nearest_stable_face():
@@ -351,5 +307,5 @@ def test_a_million_triangles(tmp_path):
     item = load_object(write(tmp_path, mesh, "pebble.stl"), mass_g=30)
     assert len(item.triangles) == 1_310_720
     assert item.volume == pytest.approx(4 / 3 * np.pi * 20**3 * 1.2 * 0.7 * MM3, rel=1e-4)
-    assert len(item.feature_points) == 0 and 4 <= len(item.support_points) <= 400
+    assert 4 <= len(item.support_points) <= 400
     assert signed_distance(item.distance, 0.03, 0.0, 0.0)[0] == pytest.approx(0.01, abs=1e-7)

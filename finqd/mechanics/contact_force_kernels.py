@@ -60,7 +60,7 @@ def _add_row(
     if want_gradient and face >= 0:
         for a in range(k):
             n = faces[face, a]
-            if n >= 0:
+            if n >= 0 and weight[a] != 0.0:
                 for i in range(3):
                     gradient[n, i] += weight[a] * force[i]
     if want_gradient and rigid >= 0:
@@ -72,10 +72,12 @@ def _add_row(
         return
     if face >= 0:
         for a in range(k):
+            if weight[a] == 0.0:  # most are: a sample lies on one piece of its face
+                continue
             for b in range(k):
                 slot = face_slots[face, a, b]
-                if slot >= 0:
-                    ww = weight[a] * weight[b]
+                ww = weight[a] * weight[b]
+                if slot >= 0 and ww != 0.0:
                     for i in range(3):
                         for j in range(3):
                             blocks[slot, i, j] += ww * matrix[i, j]
@@ -93,7 +95,7 @@ def _add_row(
     if face >= 0:
         for a in range(k):
             n = faces[face, a]
-            if n >= 0:
+            if n >= 0 and weight[a] != 0.0:
                 for i in range(3):
                     for j in range(3):
                         coupling[3 * n + i, r0 + j] -= weight[a] * matrix[i, j]
@@ -130,7 +132,7 @@ def _add_turning(faces, face, weight, rigid, turns, force, normal, arm, coupling
             if face >= 0:
                 for a in range(faces.shape[1]):
                     n = faces[face, a]
-                    if n >= 0:
+                    if n >= 0 and weight[a] != 0.0:
                         coupling[3 * n + i, r0 + 3 + j] += weight[a] * h
 
 

@@ -15,9 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, signed_distance
-
-OPPOSED, FULLY_OPPOSED = 0.05, 0.35  # cosines between which two surfaces that look at each other come to push fully
+from finqd.mechanics.distance_kernels import distance_curvature, signed_distance
 
 
 @njit(cache=True)
@@ -29,40 +27,6 @@ def face_point(positions, nodes, weight, point):
         if n >= 0:
             for i in range(3):
                 point[i] += weight[a] * positions[n, i]
-
-
-@njit(cache=True)
-def distance_curvature(field, d, y, n0, n1, rotation, normal, out):
-    """Write the second derivative [1/m] of a body's distance at a point, in the world frame, shape (3, 3).
-
-    y: the point, body frame; n0, n1: gradient's x and y there; ``normal``: gradient in the world frame. A ball's is
-    (I - n n^T)/|y|; a solid of revolution's n_r/r e e^T with e along the circumference (its profile has straight
-    pieces); a polyhedron's is 0.
-    """
-    out[:] = 0.0
-    if field.kind == SPHERE:
-        r = d + field.radius
-        for i in range(3):
-            for j in range(3):
-                out[i, j] = ((1.0 if i == j else 0.0) - normal[i] * normal[j]) / r
-    elif field.kind == REVOLUTION:
-        r2 = y[0] * y[0] + y[1] * y[1]
-        if r2 > 1e-12:
-            e = (rotation[:, 1] * y[0] - rotation[:, 0] * y[1]) / math.sqrt(r2)
-            for i in range(3):
-                for j in range(3):
-                    out[i, j] = (n0 * y[0] + n1 * y[1]) / r2 * e[i] * e[j]
-
-
-@njit(cache=True)
-def opposition(cosine):
-    """Return the share of its stiffness with which a contact acts whose sides look at each other with ``cosine``.
-
-    0 below OPPOSED, 1 above FULLY_OPPOSED, the cubic 3 t^2 - 2 t^3 between. Where two edges cross, it switches off what
-    pushes from the wrong side; gradually, since Newton's method stalls at a jump. It is held fixed in derivatives.
-    """
-    t = min(max((cosine - OPPOSED) / (FULLY_OPPOSED - OPPOSED), 0.0), 1.0)
-    return t * t * (3.0 - 2.0 * t)
 
 
 @njit(cache=True)
@@ -82,119 +46,109 @@ def face_box(positions, nodes, low, high):
 
 
 @njit(cache=True)
-def face_normals(positions, faces, corners, normals):
-    """Write the unit normals of faces with 3 or 4 ``corners``, shape (n_faces, 3)."""
-    for f in range(faces.shape[0]):
-        nodes = faces[f]
-        a, b = positions[nodes[1]] - positions[nodes[0]], positions[nodes[2]] - positions[nodes[0]]
-        if corners[f] == 4:
-            a, b = positions[nodes[2]] - positions[nodes[0]], positions[nodes[3]] - positions[nodes[1]]
-        n = np.cross(a, b)
-        normals[f] = n / max(math.sqrt(np.dot(n, n)), 1e-300)
-
-
-@njit(cache=True)
 def find_soft_rigid(
-    positions, faces, normals, first_sample, sample_weight, sample_stiffness, centre, rotation, field, low, high,
-    radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid,
-    out_turns, out_curve, count,
+    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
+    centre, rotation, field, radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm,
+    out_stiffness, out_rigid, out_turns, count,
 ):
     """Append the samples of soft faces that lie inside a rigid body; return the new count.
 
-    low, high: bounding box of the body in its own frame, shape (3,); radius: of its bounding ball [m]; normals: unit
-    normals of the faces at the start of the step, in the body's frame then, shape (n_faces, 3). A sample acts as far
-    as its face looks towards the body's surface (`opposition`), which so does not change while the body turns: the
-    forces are the derivatives of the energy.
+    pressure: stiffness of an area [N/m^3]; radius: of the body's bounding ball [m]. Rows beyond the arrays' end are
+    counted, not written. The distance is 1-Lipschitz: a sample nearer to the last one looked at than that was to the
+    body is outside.
     """
-    x, y, m = np.empty(3), np.empty(3), np.empty(3)
-    face_low, face_high = np.empty(3), np.empty(3)
+    x, y, last = np.empty(3), np.empty(3), np.empty(3)
+    low, high = np.empty(3), np.empty(3)
     for f in range(faces.shape[0]):
-        face_box(positions, faces[f], face_low, face_high)
-        apart = False
+        face_box(positions, faces[f], low, high)
+        apart, size2 = False, 0.0
         for i in range(3):
-            if face_low[i] > centre[i] + radius or face_high[i] < centre[i] - radius:
+            if low[i] > centre[i] + radius or high[i] < centre[i] - radius:
                 apart = True
+            x[i] = 0.5 * (low[i] + high[i])
+            size2 += (high[i] - low[i]) ** 2
         if apart:
             continue
-        for s in range(first_sample[f], first_sample[f + 1]):
-            face_point(positions, faces[f], sample_weight[s], x)
-            inside = True
-            for i in range(3):
-                y[i] = 0.0
-                for j in range(3):
-                    y[i] += rotation[j, i] * (x[j] - centre[j])
-                if y[i] < low[i] or y[i] > high[i]:
-                    inside = False
-                    break
-            if not inside:
+        _into_body(x, centre, rotation, y)
+        d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
+        if d > 0.5 * math.sqrt(size2):
+            continue
+        last[:] = x
+        first = lattice_first[face_lattice[f]]
+        for s in range(first, lattice_first[face_lattice[f] + 1]):
+            face_point(positions, faces[f], lattice_weight[s], x)
+            if d > 0.0 and (x[0] - last[0]) ** 2 + (x[1] - last[1]) ** 2 + (x[2] - last[2]) ** 2 < d * d:
                 continue
+            last[:] = x
+            _into_body(x, centre, rotation, y)
             d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
             if d >= 0.0:
                 continue
-            share = opposition(-(n0 * normals[f, 0] + n1 * normals[f, 1] + n2 * normals[f, 2]))
-            if share <= 0.0:
-                continue
-            for i in range(3):
-                m[i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
-            out_key[count] = first_key + s
-            out_face[count] = f
-            out_weight[count] = sample_weight[s]
-            out_gap[count] = d
-            for i in range(3):
-                out_normal[count, i] = m[i]
-                out_arm[count, i] = x[i] - centre[i]
-            out_stiffness[count] = share * sample_stiffness[s]
-            out_rigid[count] = rigid
-            out_turns[count] = 1
-            distance_curvature(field, d, y, n0, n1, rotation, m, out_curve[count])
+            if count < out_key.shape[0]:
+                out_key[count] = first_key + first_sample[f] + s - first
+                out_face[count] = f
+                out_weight[count] = lattice_weight[s]
+                out_gap[count] = d
+                for i in range(3):
+                    out_normal[count, i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
+                    out_arm[count, i] = x[i] - centre[i]
+                out_stiffness[count] = pressure * face_area[f] * lattice_share[s]
+                out_rigid[count] = rigid
+                out_turns[count] = 1
             count += 1
     return count
 
 
 @njit(cache=True)
+def _into_body(x, centre, rotation, y):
+    """Write a point's coordinates in the frame of a body, y = R^T (x - c)."""
+    for i in range(3):
+        y[i] = 0.0
+        for j in range(3):
+            y[i] += rotation[j, i] * (x[j] - centre[j])
+
+
+@njit(cache=True)
 def find_soft_plane(
-    positions, faces, normals, first_sample, sample_weight, sample_stiffness, point, normal, first_key,
-    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
-    count,
+    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
+    point, normal, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid,
+    out_turns, count,
 ):
     """Append the samples of soft faces below a plane, as `find_soft_rigid` does; return the new count."""
-    x, face_low, face_high = np.empty(3), np.empty(3), np.empty(3)
+    x, low, high = np.empty(3), np.empty(3), np.empty(3)
     for f in range(faces.shape[0]):
-        face_box(positions, faces[f], face_low, face_high)
+        face_box(positions, faces[f], low, high)
         lowest = 0.0
         for i in range(3):
-            lowest += normal[i] * ((face_low[i] if normal[i] > 0.0 else face_high[i]) - point[i])
+            lowest += normal[i] * ((low[i] if normal[i] > 0.0 else high[i]) - point[i])
         if lowest >= 0.0:
             continue
-        for s in range(first_sample[f], first_sample[f + 1]):
-            face_point(positions, faces[f], sample_weight[s], x)
+        first = lattice_first[face_lattice[f]]
+        for s in range(first, lattice_first[face_lattice[f] + 1]):
+            face_point(positions, faces[f], lattice_weight[s], x)
             d = 0.0
             for i in range(3):
                 d += normal[i] * (x[i] - point[i])
             if d >= 0.0:
                 continue
-            share = opposition(-np.dot(normal, normals[f]))
-            if share <= 0.0:
-                continue
-            out_key[count] = first_key + s
-            out_face[count] = f
-            out_weight[count] = sample_weight[s]
-            out_gap[count] = d
-            out_normal[count] = normal
-            out_arm[count] = 0.0
-            out_stiffness[count] = share * sample_stiffness[s]
-            out_rigid[count] = -1
-            out_turns[count] = 0
-            out_curve[count] = 0.0
+            if count < out_key.shape[0]:
+                out_key[count] = first_key + first_sample[f] + s - first
+                out_face[count] = f
+                out_weight[count] = lattice_weight[s]
+                out_gap[count] = d
+                out_normal[count] = normal
+                out_arm[count] = 0.0
+                out_stiffness[count] = pressure * face_area[f] * lattice_share[s]
+                out_rigid[count] = -1
+                out_turns[count] = 0
             count += 1
     return count
 
 
 @njit(cache=True)
 def find_rigid_plane(
-    points, ball_radius, centre, rotation, point, normal, stiffness, rigid, first_key,
-    out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, out_curve,
-    count,
+    points, ball_radius, centre, rotation, point, normal, stiffness, rigid, first_key, out_key, out_face, out_weight,
+    out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, count,
 ):
     """Append the support points of a rigid body below a plane; return the new count.
 
@@ -213,55 +167,73 @@ def find_rigid_plane(
             d += normal[i] * (centre[i] + arm[i] - point[i])
         if d >= 0.0:
             continue
-        out_key[count] = first_key + s
-        out_face[count] = -1
-        out_weight[count] = 0.0
-        out_gap[count] = d
-        out_normal[count] = -normal
-        out_arm[count] = arm
-        out_stiffness[count] = stiffness
-        out_rigid[count] = rigid
-        out_turns[count] = 0 if ball_radius > 0.0 else -1
-        out_curve[count] = 0.0
+        if count < out_key.shape[0]:
+            out_key[count] = first_key + s
+            out_face[count] = -1
+            out_weight[count] = 0.0
+            out_gap[count] = d
+            out_normal[count] = -normal
+            out_arm[count] = arm
+            out_stiffness[count] = stiffness
+            out_rigid[count] = rigid
+            out_turns[count] = 0 if ball_radius > 0.0 else -1
         count += 1
     return count
 
 
 @njit(cache=True)
-def soft_step_limit(
-    positions, soft_direction, faces, sample_face, sample_weight, spacing, centre, rotation, field, low, high,
-    shift, spin, allowance,
-):
-    """Return the share of a move in which no soft sample can pass more than ``allowance`` [m] into a rigid body.
-
-    The distance is 1-Lipschitz, so a sample at distance d is safe while its motion relative to the body stays below
-    max(d - spacing/2, 0) + allowance; outside the body's box the distance to the box bounds d from below.
-    """
-    x, u, y = np.empty(3), np.empty(3), np.empty(3)
-    limit = 1.0
-    for s in range(sample_face.shape[0]):
-        nodes = faces[sample_face[s]]
-        face_point(positions, nodes, sample_weight[s], x)
-        face_point(soft_direction, nodes, sample_weight[s], u)
-        r = x - centre
-        u[0] -= shift[0] + spin[1] * r[2] - spin[2] * r[1]
-        u[1] -= shift[1] + spin[2] * r[0] - spin[0] * r[2]
-        u[2] -= shift[2] + spin[0] * r[1] - spin[1] * r[0]
-        move = math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-        if move <= allowance:
+def find_curvatures(field, rotation, rigid, row_rigid, turns, gap, normal, arm, curve, count):
+    """Write the second derivative of the gap of each row of one rigid body with soft faces, world frame [1/m]."""
+    y, n, local = np.empty(3), np.empty(3), np.empty((3, 3))
+    for c in range(count):
+        if row_rigid[c] != rigid or turns[c] != 1:
             continue
-        outside = 0.0
         for i in range(3):
-            y[i] = rotation[0, i] * r[0] + rotation[1, i] * r[1] + rotation[2, i] * r[2]
-            e = max(low[i] - y[i], y[i] - high[i], 0.0)
-            outside += e * e
-        d = math.sqrt(outside)
-        if move > d - 0.5 * spacing + allowance:
-            if d == 0.0:
-                d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
-            free = max(d - 0.5 * spacing, 0.0) + allowance
-            if move * limit > free:
-                limit = free / move
+            y[i] = n[i] = 0.0
+            for j in range(3):
+                y[i] += rotation[j, i] * arm[c, j]
+                n[i] += rotation[j, i] * normal[c, j]
+        distance_curvature(field, gap[c], y[0], y[1], y[2], n, local)
+        curve[c] = rotation @ local @ rotation.T
+
+
+@njit(cache=True)
+def soft_step_limit(positions, direction, faces, centre, rotation, field, radius, shift, spin, allowance):
+    """Return the share of a move in which no point of a soft face can pass more than ``allowance`` [m] into a body.
+
+    direction: of the soft vertices, shift and spin: of the body. The distance is 1-Lipschitz, and no point of a face
+    moves farther against the body than its vertices do: the face's weights are shares. A face is safe while that stays
+    below the distance of its box from the body, plus the allowance.
+    """
+    x, y, low, high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    limit = 1.0
+    for f in range(faces.shape[0]):
+        farthest = 0.0
+        for a in range(faces.shape[1]):
+            n = faces[f, a]
+            if n < 0:
+                continue
+            r0, r1, r2 = positions[n, 0] - centre[0], positions[n, 1] - centre[1], positions[n, 2] - centre[2]
+            u0 = direction[n, 0] - shift[0] - spin[1] * r2 + spin[2] * r1
+            u1 = direction[n, 1] - shift[1] - spin[2] * r0 + spin[0] * r2
+            u2 = direction[n, 2] - shift[2] - spin[0] * r1 + spin[1] * r0
+            farthest = max(farthest, math.sqrt(u0 * u0 + u1 * u1 + u2 * u2))
+        if farthest * limit <= allowance:
+            continue
+        face_box(positions, faces[f], low, high)
+        size2, away2 = 0.0, 0.0
+        for i in range(3):
+            x[i] = 0.5 * (low[i] + high[i])
+            size2 += (high[i] - low[i]) ** 2
+            away2 += (x[i] - centre[i]) ** 2
+        free = max(math.sqrt(away2) - radius - 0.5 * math.sqrt(size2), 0.0) + allowance
+        if farthest * limit <= free:
+            continue
+        _into_body(x, centre, rotation, y)
+        d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
+        free = max(d - 0.5 * math.sqrt(size2), 0.0) + allowance
+        if farthest * limit > free:
+            limit = free / farthest
     return limit
 
 

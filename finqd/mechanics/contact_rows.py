@@ -39,18 +39,26 @@ class FrictionRows:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeaturePlanes:
-    """Tangent planes that the features of one rigid body meet on one soft body; n planes, held over a Newton solve.
+class KeyedValues:
+    """Values of some of many contacts: ``keys`` (n,), ascending, and ``values`` (n, ...); all others have 0."""
 
-    point: feature, face: soft face, (n,); weight: the plane's point on the face, (n, k)
-    normal: unit, from the rigid to the soft side, (n, 3); stiffness [N/m], (n,)
-    """
+    keys: np.ndarray
+    values: np.ndarray
 
-    point: np.ndarray
-    face: np.ndarray
-    weight: np.ndarray
-    normal: np.ndarray
-    stiffness: np.ndarray
+    @classmethod
+    def of(cls, keys: np.ndarray, values: np.ndarray) -> KeyedValues:
+        """Return ``values`` by their ``keys``, of which none comes twice."""
+        order = np.argsort(keys)
+        return cls(keys=keys[order], values=values[order])
+
+    def at(self, keys: np.ndarray) -> np.ndarray:
+        """Return the values at ``keys``, in their order."""
+        found = np.zeros((len(keys), *self.values.shape[1:]))
+        if len(self.keys):
+            place = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+            known = self.keys[place] == keys
+            found[known] = self.values[place[known]]
+        return found
 
 
 class Rows:
@@ -70,11 +78,15 @@ class Rows:
         self.curve = np.zeros((capacity, 3, 3))
 
     @property
+    def capacity(self) -> int:
+        """Number of rows that there is room for."""
+        return len(self.key)
+
+    @property
     def arrays(self) -> tuple[np.ndarray, ...]:
-        """All columns, in the order in which kernels take them."""
+        """The columns that finding contacts fills, in the order in which kernels take them."""
         return (
             self.key, self.face, self.weight, self.gap, self.normal, self.arm, self.stiffness, self.rigid, self.turns,
-            self.curve,
         )
 
     def forces(self, smoothing: float) -> np.ndarray:
@@ -83,7 +95,7 @@ class Rows:
         return stiffness * np.where(depth < smoothing, depth**2 / (2.0 * smoothing), depth - 0.5 * smoothing)
 
     def friction(
-        self, *, state: State, start: State, faces: np.ndarray, bound: np.ndarray, slips: np.ndarray, ratio: float
+        self, *, state: State, start: State, faces: np.ndarray, bound: np.ndarray, slips: KeyedValues, ratio: float
     ) -> FrictionRows:
         """Return the frictional contacts among the rows found at ``state``, referred to ``start``.
 
@@ -96,7 +108,7 @@ class Rows:
         soft = face >= 0
         nodes = faces[face[soft]]
         point[soft] = np.einsum("na,nax->nx", np.where(nodes >= 0, weight[soft], 0.0), start.positions[nodes])
-        arm, slip = self.arm[used], slips[key]
+        arm, slip = self.arm[used], slips.at(key)
         for r in range(len(start.rigid_positions)):
             mine = rigid == r
             turning = mine & (self.turns[used] != 0)  # a ball touches a plane with its lowest point, however it turns

@@ -1,4 +1,4 @@
-"""The surface of all soft bodies as contact sees it: faces, sample points and flat triangles."""
+"""The surface of all soft bodies as contact sees it: faces and sample points."""
 
 from __future__ import annotations
 
@@ -13,78 +13,52 @@ from finqd.scene import SoftBody
 
 @dataclass(frozen=True, kw_only=True)
 class ContactSurface:
-    """Faces, samples and triangles of all soft bodies, in scene numbering.
+    """Faces and sample points of all soft bodies, in scene numbering.
 
-    faces: vertex ids, -1 pads, shape (n_faces, k); face_body, face_corners: soft body and number of corners (3 or 4) of
-        each face, shape (n_faces,)
-    first_sample: samples first_sample[f] to first_sample[f + 1] lie on face f, shape (n_faces + 1,)
-    sample_face, sample_weight (n_samples, k), sample_area [m^2]: points that are finer than the mesh; points that
-        neighbouring faces share are merged, but not across a sharp edge, where each side needs its own normal
-    triangle_face, triangle_weight (n_triangles, 3, k): faces cut into flat triangles, corners as weights on the face
+    faces: vertex ids, -1 pads, shape (n_faces, k); face_body: soft body of each face, face_area: at rest [m^2], both of
+        shape (n_faces,)
+    face_lattice: which lattice of samples a face has, shape (n_faces,); lattice l has the rows lattice_first[l] to
+        lattice_first[l + 1] of lattice_weight (n, k), a sample's weights of the face's vertices, and of lattice_share
+        (n,), its share of the area
+    first_sample: numbers of the samples of face f, first_sample[f] to first_sample[f + 1], shape (n_faces + 1,)
     """
 
     faces: np.ndarray
     face_body: np.ndarray
-    face_corners: np.ndarray
+    face_area: np.ndarray
+    face_lattice: np.ndarray
+    lattice_first: np.ndarray
+    lattice_weight: np.ndarray
+    lattice_share: np.ndarray
     first_sample: np.ndarray
-    sample_face: np.ndarray
-    sample_weight: np.ndarray
-    sample_area: np.ndarray
-    triangle_face: np.ndarray
-    triangle_weight: np.ndarray
 
     @property
-    def sample_body(self) -> np.ndarray:
-        """Soft body of each sample, shape (n_samples,)."""
-        return self.face_body[self.sample_face]
+    def n_samples(self) -> int:
+        """Number of samples of all faces."""
+        return int(self.first_sample[-1])
 
     @property
-    def triangle_body(self) -> np.ndarray:
-        """Soft body of each triangle, shape (n_triangles,)."""
-        return self.face_body[self.triangle_face]
-
-
-#: corners of the flat triangles of a face in its local coordinates; a quadrilateral gets its middle as a fourth
-#: corner pair, so that the split has the face's own symmetry
-_TRIANGLES = {
-    "tri3": [[(0, 0), (1, 0), (0, 1)]],
-    "tri6": [
-        [(0, 0), (0.5, 0), (0, 0.5)], [(0.5, 0), (1, 0), (0.5, 0.5)],
-        [(0, 0.5), (0.5, 0.5), (0, 1)], [(0.5, 0), (0.5, 0.5), (0, 0.5)],
-    ],
-    "quad4": [
-        [(-1, -1), (1, -1), (0, 0)], [(1, -1), (1, 1), (0, 0)], [(1, 1), (-1, 1), (0, 0)], [(-1, 1), (-1, -1), (0, 0)],
-    ],
-}
-_TRIANGLES["quad8"] = [
-    [edge, corner, (0, 0)]
-    for ring in ([(-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)],)
-    for edge, corner in zip(ring, ring[1:] + ring[:1], strict=True)
-]
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What kernels take, in their order."""
+        return (
+            self.faces, self.face_area, self.face_lattice, self.lattice_first, self.lattice_weight, self.lattice_share,
+            self.first_sample,
+        )
 
 
 def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return local points (p, 2) of a lattice with n by m cells (n by n for a triangle) and their shares of the area.
+    """Return local points (p, 2) in the middles of n by m cells (n by n for a triangle) and their shares of the area.
 
-    The lattice includes the face's edges, since a face's rim is what touches first; the shares are the trapezoidal
-    rule's and sum to 1.
+    None lies on the face's rim: where a body stands on a face, the faces beside that one would push along.
     """
     if face_type.startswith("quad"):
-        u, v = np.linspace(-1, 1, n + 1), np.linspace(-1, 1, m + 1)
-        wu, wv = np.full(n + 1, 1.0 / n), np.full(m + 1, 1.0 / m)
-        wu[[0, -1]] *= 0.5
-        wv[[0, -1]] *= 0.5
+        u, v = ((2.0 * np.arange(cells) + 1.0) / cells - 1.0 for cells in (n, m))
         points = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
-        return points, np.outer(wu, wv).ravel()
-    index = {(i, j): None for i in range(n + 1) for j in range(n + 1 - i)}
-    order = {key: p for p, key in enumerate(index)}
-    share = np.zeros(len(order))
-    for i, j in order:
-        for cell in ([(i, j), (i + 1, j), (i, j + 1)], [(i + 1, j), (i + 1, j + 1), (i, j + 1)]):
-            if all(corner in order for corner in cell):
-                for corner in cell:
-                    share[order[corner]] += 1.0 / (3 * n * n)
-    return np.array(list(order), dtype=float) / n, share
+    else:
+        upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
+        turned = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
+        points = np.array(upright + turned) / n
+    return points, np.full(len(points), 1.0 / len(points))
 
 
 def contact_shape(face_type: str, xi: np.ndarray) -> np.ndarray:
@@ -136,80 +110,39 @@ def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
     return np.maximum(np.ceil(np.stack([u, v], axis=1) / spacing - 1e-6), 1).astype(int)
 
 
-def _samples(
-    points: np.ndarray, face_type: str, first_face: int, spacing: float, width: int
-) -> tuple[np.ndarray, ...]:
-    """Return (face, weight, area, position, normal) of all samples of one block of faces."""
-    cells, vectors = _cells(points, face_type, spacing), _face_vectors(points, face_type)
-    areas = np.linalg.norm(vectors, axis=1)
-    normals = vectors / areas[:, None]
-    found: list[tuple[np.ndarray, ...]] = []
-    for n, m in np.unique(cells, axis=0):
-        local, share = lattice(face_type, int(n), int(m))
-        shape = contact_shape(face_type, local)
-        which = np.flatnonzero((cells == (n, m)).all(axis=1))
-        weight = np.zeros((len(which) * len(local), width))
-        weight[:, : shape.shape[1]] = np.tile(shape, (len(which), 1))
-        found.append(
-            (
-                np.repeat(which + first_face, len(local)), weight, np.outer(areas[which], share).ravel(),
-                np.einsum("pk,fkx->fpx", shape, points[which]).reshape(-1, 3),
-                np.repeat(normals[which], len(local), axis=0),
-            )
-        )
-    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
-
-
-def _merged(parts: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge samples of one body that coincide at rest (to 1 nm) on faces of like direction, adding their areas."""
-    face, weight, area, position, normal = parts
-    key = np.concatenate([np.round(position, 9), np.round(2.0 * normal)], axis=1)
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    return face[first], weight[first], np.bincount(inverse.ravel(), area)
-
-
 def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSurface:
     """Return the surface of ``bodies`` with samples at most ``spacing`` [m] apart; faces that are held are left out."""
-    kinds = [(body, kind) for body in bodies for kind, faces in sorted(body.mesh.faces.items()) if len(faces)]
-    width = max((body.mesh.faces[kind].shape[1] for body, kind in kinds), default=4)
-    faces, face_body, face_corners, samples, triangles = [], [], [], [], []
-    first_face = 0
+    width = max((f.shape[1] for body in bodies for f in body.mesh.faces.values() if len(f)), default=4)
+    lattices: dict[tuple[str, int, int], int] = {}
+    weights, shares = [np.zeros((0, width))], [np.zeros(0)]
+    faces, owner, area, which = [np.zeros((0, width), dtype=np.int64)], [], [], []
     for number, body in enumerate(bodies):
-        parts = []
         for kind in sorted(body.mesh.faces):
             block = body.mesh.faces[kind]
             block = block[~body.fixed.all(axis=1)[block].all(axis=1)] if len(block) else block
             if not len(block):
                 continue
-            padded = np.full((len(block), width), -1, dtype=np.int64)
-            padded[:, : block.shape[1]] = block + body.first_vertex
-            faces.append(padded)
-            face_body.append(np.full(len(block), number))
-            face_corners.append(np.full(len(block), 4 if kind.startswith("quad") else 3))
-            parts.append(_samples(body.mesh.vertices[block], kind, first_face, spacing, width))
-            local = np.array(_TRIANGLES[kind], dtype=float).reshape(-1, 2)
-            corners = contact_shape(kind, local).reshape(-1, 3, block.shape[1])
-            weight = np.zeros((len(block) * len(corners), 3, width))
-            weight[:, :, : block.shape[1]] = np.tile(corners, (len(block), 1, 1))
-            triangles.append((np.repeat(np.arange(len(block)) + first_face, len(corners)), weight))
-            first_face += len(block)
-        if parts:
-            samples.append(_merged(tuple(np.concatenate(p) for p in zip(*parts, strict=True))))
-    if not faces:
-        empty = np.zeros(0, dtype=np.int64)
-        return ContactSurface(
-            faces=np.zeros((0, width), dtype=np.int64), face_body=empty, face_corners=empty,
-            first_sample=np.zeros(1, dtype=np.int64), sample_face=empty,
-            sample_weight=np.zeros((0, width)), sample_area=np.zeros(0), triangle_face=empty,
-            triangle_weight=np.zeros((0, 3, width)),
-        )
-    sample_face, sample_weight, sample_area = (np.concatenate(p) for p in zip(*samples, strict=True))
-    order = np.argsort(sample_face, kind="stable")
-    sample_face, sample_weight, sample_area = sample_face[order], sample_weight[order], sample_area[order]
-    triangle_face, triangle_weight = (np.concatenate(p) for p in zip(*triangles, strict=True))
+            points = body.mesh.vertices[block]
+            faces.append(_padded(block + body.first_vertex, width, -1))
+            owner.append(np.full(len(block), number))
+            area.append(np.linalg.norm(_face_vectors(points, kind), axis=1))
+            for n, m in _cells(points, kind, spacing):
+                if (kind, n, m) not in lattices:
+                    lattices[kind, n, m] = len(lattices)
+                    local, share = lattice(kind, int(n), int(m))
+                    weights.append(_padded(contact_shape(kind, local), width, 0.0))
+                    shares.append(share)
+                which.append(lattices[kind, n, m])
+    first = np.cumsum([0] + [len(share) for share in shares[1:]])
+    face_lattice = np.array(which, dtype=np.int64)
     return ContactSurface(
-        faces=np.concatenate(faces), face_body=np.concatenate(face_body), face_corners=np.concatenate(face_corners),
-        first_sample=np.searchsorted(sample_face, np.arange(first_face + 1)), sample_face=sample_face,
-        sample_weight=sample_weight, sample_area=sample_area, triangle_face=triangle_face,
-        triangle_weight=triangle_weight,
+        faces=np.concatenate(faces), face_body=np.concatenate([np.zeros(0, dtype=np.int64), *owner]),
+        face_area=np.concatenate([np.zeros(0), *area]), face_lattice=face_lattice, lattice_first=first,
+        lattice_weight=np.concatenate(weights), lattice_share=np.concatenate(shares),
+        first_sample=np.concatenate([[0], np.cumsum(np.diff(first)[face_lattice])]).astype(np.int64),
     )
+
+
+def _padded(rows: np.ndarray, width: int, filler: float) -> np.ndarray:
+    """Return ``rows`` with columns of ``filler`` up to ``width``."""
+    return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=filler)

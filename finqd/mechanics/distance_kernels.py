@@ -16,7 +16,7 @@ TOUCHING = 1e-12  # below this distance [m] the direction to the closest point i
 
 #: kind: SPHERE, REVOLUTION or SURFACE
 #: leaf_size: triangles a leaf of the tree
-#: radius: of the sphere [m]
+#: radius: of the sphere; of the others, how far outside the rows' surface the body's own surface lies [m]
 #: rows: of a solid of revolution, shape (n, 12), one profile segment each: start r, z, edge r, z [m], 1 / length^2
 #:     [1/m^2], outward normal r, z, unit pseudonormals r, z at its start and at its end, 0;
 #:     of a surface, shape (n_slots, 12), one triangle each, in the order of the tree's leaves: corners a, b, c [m],
@@ -218,7 +218,8 @@ def signed_distance(field, x, y, z):
     """Return ``(d, nx, ny, nz)``: signed distance [m], negative inside, and its gradient, a unit vector outwards.
 
     field: `DistanceField`; x, y, z: a point in the field's frame [m]. The gradient is continuous through d = 0 on
-    faces; where the closest point is not unique (the medial axis) it belongs to one of them.
+    faces; where the closest point is not unique (the medial axis) it belongs to one of them. Of a body with rounded
+    edges (``radius`` > 0) it is continuous down to that depth.
     """
     if field.kind == SPHERE:
         length = np.sqrt(x * x + y * y + z * z)
@@ -226,10 +227,12 @@ def signed_distance(field, x, y, z):
             return length - field.radius, x / length, y / length, z / length
         return -field.radius, 0.0, 0.0, 1.0
     if field.kind == REVOLUTION:
-        return _revolution_distance(field.rows, x, y, z)
-    return _surface_distance(
-        field.rows, field.features, field.pseudonormals, field.boxes, field.leaf_size, x, y, z
-    )
+        d, n0, n1, n2 = _revolution_distance(field.rows, x, y, z)
+    else:
+        d, n0, n1, n2 = _surface_distance(
+            field.rows, field.features, field.pseudonormals, field.boxes, field.leaf_size, x, y, z
+        )
+    return d - field.radius, n0, n1, n2
 
 
 @njit(cache=True, error_model="numpy")
@@ -241,3 +244,50 @@ def signed_distances(field, points, distances, normals):
         normals[i, 0] = nx
         normals[i, 1] = ny
         normals[i, 2] = nz
+
+
+@njit(cache=True, error_model="numpy")
+def distance_curvature(field, d, x, y, z, n, out):
+    r"""Write the second derivative [1/m] of the distance at a point outside the rows' surface, shape (3, 3).
+
+    d: the distance there [m]; n: its gradient, shape (3,). With e = d + ``radius``, the distance from the rows: 0 over
+    faces, (I - n n^T - t t^T)/e over an edge along t, (I - n n^T)/e over a corner and a ball's centre; of a solid of
+    revolution, with t along the circumference, t t^T n_r/r, and over corners of the profile (t x n)(t x n)^T/e too.
+    """
+    out[:] = 0.0
+    e = d + field.radius
+    if field.kind == REVOLUTION:
+        r = np.sqrt(x * x + y * y)
+        t0, t1, bend = 0.0, 1.0, 0.0
+        if r > TOUCHING:
+            t0, t1, bend = -y / r, x / r, (n[0] * x + n[1] * y) / (r * r)
+        _, along = _closest_segment(field.rows, r, z)
+        corner = 1.0 / e if (along == 0.0 or along == 1.0) and e > TOUCHING else 0.0
+        s = (t1 * n[2], -t0 * n[2], t0 * n[1] - t1 * n[0])
+        t = (t0, t1, 0.0)
+        for i in range(3):
+            for j in range(3):
+                out[i, j] = bend * t[i] * t[j] + corner * s[i] * s[j]
+        return
+    if e <= TOUCHING:
+        return
+    feature, slot = 4, 0
+    if field.kind == SURFACE:
+        slot = _closest_slot(field.rows, field.boxes, field.leaf_size, x, y, z)
+        _, _, feature = _closest_parameters(field.rows, slot, x, y, z)
+        if feature == 0:
+            return
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = ((1.0 if i == j else 0.0) - n[i] * n[j]) / e
+    if feature <= 3:
+        a, b = 3 * (feature - 1), 3 * (feature % 3)
+        length2 = 0.0
+        for i in range(3):
+            length2 += (field.rows[slot, b + i] - field.rows[slot, a + i]) ** 2
+        for i in range(3):
+            for j in range(3):
+                side = (field.rows[slot, b + i] - field.rows[slot, a + i]) * (
+                    field.rows[slot, b + j] - field.rows[slot, a + j]
+                )
+                out[i, j] -= side / (length2 * e)

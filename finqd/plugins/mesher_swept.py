@@ -33,7 +33,8 @@ class Swept:
     puts mid-edge nodes next to a notch at a quarter of their edge, where they follow its stress (order 2 only). A
     profile that comes in patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by
     interpolation, without wedges; any other by gmsh. ``order``: 2 gives quadratic hexahedra (hex20, straight edges, a
-    node in the middle of each); there is no quadratic wedge, so that a profile that leaves triangles is refused then.
+    node in the middle of each); there is no quadratic wedge, so that a profile whose mesh leaves triangles is meshed
+    twice as coarse then, and all its elements are cut into quadrilaterals.
     ``tetrahedra``: each hexahedron is cut into six, each wedge into three: another family of elements on the same
     nodes, to compare with.
     """
@@ -56,11 +57,6 @@ class Swept:
             raise MeshError(f"the profile's best mesh has a turned element (sine of its corner {worst:.2g})")
         if self.tetrahedra:
             plane = _cut(plane)
-        elif self.order == 2 and len(plane.triangles):
-            raise MeshError(
-                f"the profile's mesh has {len(plane.triangles)} triangles, and there are no quadratic wedges: use "
-                "order 1, another size_mm, or the mesher 'tetrahedral' with order 2"
-            )
         mesh = self._sweep(plane, solid.thickness)
         if self.tetrahedra:
             mesh = Mesh(mesh.vertices, {"tet4": _tetrahedra(mesh.blocks["wedge6"])})
@@ -73,12 +69,13 @@ class Swept:
     def _plane(self, solid: Prism) -> PlaneMesh:
         patches = solid.patches or _single_patch(solid)
         first = self._from_patches(solid, patches) if patches else None
-        if first and (first.worst() >= _GOOD_ENOUGH or self.order == 2):  # paving leaves triangles: no quadratic wedges
+        if first and first.worst() >= _GOOD_ENOUGH:
             return first
-        from finqd.plugins.swept_paving import pave
+        from finqd.plugins.swept_paving import pave, pave_with_quads
 
         try:
-            second = pave(solid, self.size_mm * MM, self.least_edges)
+            paving = pave_with_quads if self.order == 2 and not self.tetrahedra else pave  # there is no quadratic wedge
+            second = paving(solid, self.size_mm * MM, self.least_edges)
         except MeshError:
             if first is None:
                 raise

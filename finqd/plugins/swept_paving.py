@@ -41,6 +41,31 @@ def pave(solid: Prism, size: float, least: int) -> PlaneMesh:
     return best
 
 
+def pave_with_quads(solid: Prism, size: float, least: int) -> PlaneMesh:
+    """Return a mesh as `pave`, but if triangles remain, one of twice the size with each element cut into quads."""
+    plane = pave(solid, size, least)
+    return cut_into_quads(pave(solid, 2.0 * size, least)) if len(plane.triangles) else plane
+
+
+def cut_into_quads(plane: PlaneMesh) -> PlaneMesh:
+    """Return the mesh with each element cut into quadrilaterals from its middle to the middles of its edges."""
+    points, quads, count = [plane.points], [], len(plane.points)
+    kinds = [elements for elements in (plane.quads, plane.triangles) if len(elements)]
+    edges = np.concatenate([np.stack([e, np.roll(e, -1, axis=1)], axis=2).reshape(-1, 2) for e in kinds])
+    ends, edge_of = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    points.append(plane.points[ends].mean(axis=1))
+    middle_of, count = count + edge_of.ravel(), count + len(ends)
+    for elements in kinds:
+        after = middle_of[: elements.size].reshape(elements.shape)
+        middle_of = middle_of[elements.size :]
+        centre = count + np.arange(len(elements))
+        points.append(plane.points[elements].mean(axis=1))
+        count += len(elements)
+        corners = (elements, after, np.broadcast_to(centre[:, None], elements.shape), np.roll(after, 1, axis=1))
+        quads.append(np.stack(corners, axis=2).reshape(-1, 4))
+    return PlaneMesh(np.concatenate(points), np.concatenate(quads), np.empty((0, 3), dtype=int))
+
+
 def _attempt(solid: Prism, size: float, algorithm: int, recombination: int) -> PlaneMesh:
     outer = solid.outer if ring_area(solid.outer) > 0 else solid.outer[::-1]
     with gmsh_session() as gmsh:

@@ -1,55 +1,11 @@
-"""What of an object pokes and what it stands on: samples of its sharp edges, points of its hull, its pose at rest."""
+"""What an object stands on: points of its hull, and its pose at rest."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from finqd.mechanics.distance import corner_angles, triangle_normals
-
-SPACING = 1e-3  # between samples of a sharp edge [m]
-SHARP = np.deg2rad(20.0)  # a smaller angle between two faces' normals is a curved surface's facet, not an edge
-FEATURE_LIMIT = 20_000  # samples; a rough scan is sampled more coarsely
 SUPPORT_LIMIT = 400  # points; on a ball of 20 mm in radius the floor then reaches up to 0.2 mm between them
 STABLE = np.deg2rad(1.0)  # tilt that a resting pose must survive
-
-
-def surface_features(
-    vertices: np.ndarray, triangles: np.ndarray, topology: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (points (n, 3), lengths (n,)) [m]: samples of sharp convex edges, then tips with length 0.
-
-    vertices: [m], shape (k, 3); triangles: shape (m, 3), watertight and outward; topology: of `triangle_neighbours`.
-    """
-    normals, _ = triangle_normals(vertices, triangles, topology[1])
-    ends = _sharp_edges(vertices, triangles, normals, topology)
-    tips = _sharp_vertices(vertices, triangles, normals)
-    edge_lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    spacing = SPACING
-    while True:
-        points, lengths = _sample_edges(ends, edge_lengths, spacing)
-        if len(points) <= FEATURE_LIMIT:
-            break
-        spacing *= 2.0
-    tips = tips[:: -(-len(tips) // FEATURE_LIMIT)] if len(tips) else tips
-    return np.concatenate([points, vertices[tips]]), np.concatenate([lengths, np.zeros(len(tips))])
-
-
-def revolution_features(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (points, lengths) as `surface_features`: rings on the sharp rims of a profile (r, z) [m], and its tips."""
-    edges = np.roll(profile, -1, axis=0) - profile
-    before = np.roll(edges, 1, axis=0)
-    turn = np.arctan2(before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0], np.einsum("ij,ij->i", before, edges))
-    points, lengths = [np.zeros((0, 3))], [np.zeros(0)]
-    for (r, z), angle in zip(profile, turn):
-        # at the axis the profile meets its mirror image: an edge that leaves the axis at a right angle is no tip
-        if r == 0.0 and angle > np.pi / 2.0 + SHARP / 2.0:
-            points.append(np.array([[0.0, 0.0, z]]))
-            lengths.append(np.zeros(1))
-        elif r > 0.0 and angle > SHARP:
-            n = max(8, int(np.ceil(2.0 * np.pi * r / SPACING)))
-            points.append(ring(r, z, n))
-            lengths.append(np.full(n, 2.0 * np.pi * r / n))
-    return np.concatenate(points), np.concatenate(lengths)
 
 
 def ring(r: float, z: float, n: int) -> np.ndarray:
@@ -157,55 +113,6 @@ def _turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
         return np.diag([1.0, -1.0, -1.0]) if abs(start[0]) < 0.5 else np.diag([-1.0, 1.0, -1.0])
     cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
-
-
-def _sharp_edges(
-    vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray, topology: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
-    """Return end points [m] of the edges whose faces turn outwards by more than `SHARP`, shape (n, 2, 3)."""
-    edge_of, neighbours = topology
-    position = np.empty(edge_of.max() + 1, dtype=np.int64)
-    position[edge_of.reshape(-1)] = np.arange(edge_of.size)
-    here, side = np.divmod(position, 3)
-    there = neighbours[here, side]
-    sharp = np.flatnonzero(np.einsum("ij,ij->i", normals[here], normals[there]) < np.cos(SHARP))
-    here, side, there = here[sharp], side[sharp], there[sharp]
-    towards = vertices[triangles[there]].mean(axis=1) - vertices[triangles[here]].mean(axis=1)
-    convex = np.einsum("ij,ij->i", normals[there] - normals[here], towards) > 0.0
-    edges = np.stack([triangles[here, side], triangles[here, (side + 1) % 3]], axis=1)
-    return vertices[edges[convex]]
-
-
-def _sharp_vertices(vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the vertices that are tips: their faces leave more than `SHARP` of the full angle open, all edges drop."""
-    angles = corner_angles(vertices, triangles)
-    around = np.bincount(triangles.reshape(-1), weights=angles.reshape(-1), minlength=len(vertices))
-    tip = (around > 0.0) & (2.0 * np.pi - around > SHARP)
-    outward = np.zeros((len(vertices), 3))
-    for corner in range(3):
-        rows = np.flatnonzero(tip[triangles[:, corner]])
-        np.add.at(outward, triangles[rows, corner], angles[rows, corner, None] * normals[rows])
-    for start, end in ((0, 1), (1, 2), (2, 0)):  # each edge runs both ways in its two triangles
-        rows = np.flatnonzero(tip[triangles[:, start]])
-        a, b = triangles[rows, start], triangles[rows, end]
-        rises = np.einsum("ij,ij->i", vertices[b] - vertices[a], outward[a]) > 0.0
-        tip[a[rises]] = False
-    return np.flatnonzero(tip)
-
-
-def _sample_edges(ends: np.ndarray, lengths: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return midpoints and lengths of pieces of edges no longer than ``spacing``; much shorter pieces are merged."""
-    counts = np.maximum(1, np.ceil(lengths / spacing - 1e-9).astype(np.int64))
-    edge = np.repeat(np.arange(len(ends)), counts)
-    piece = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
-    share = (piece + 0.5) / counts[edge]
-    points = ends[edge, 0] + share[:, None] * (ends[edge, 1] - ends[edge, 0])
-    pieces = lengths[edge] / counts[edge]
-    short = pieces < spacing / 2.0
-    cells = np.floor(points[short] / (spacing / 2.0)).astype(np.int64)
-    _, first, cell = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    merged = np.bincount(cell.reshape(-1), weights=pieces[short], minlength=len(first))
-    return np.concatenate([points[~short], points[short][first]]), np.concatenate([pieces[~short], merged])
 
 
 def _extremes(vertices: np.ndarray, n_directions: int = 1000) -> np.ndarray:
