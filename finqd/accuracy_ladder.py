@@ -31,9 +31,12 @@ NUMERICAL_CONSTANTS = ("time_step_ms", "wall_clock_limit_s")
 
 _TET4: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 1}
 _TET10: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 2}
-_HEX8: dict[str, Any] = {"mesher": "swept"}
-_HEX20: dict[str, Any] = {"mesher": "swept", "mesher.order": 2}
-_QUARTER: dict[str, Any] = {**_HEX20, "mesher.layers": 2, "mesher.grading": 1.5, "mesher.notch_nodes": "quarter"}
+#: whatever the preset says of the swept mesher
+_HEX8: dict[str, Any] = {
+    "mesher": "swept", "mesher.order": 1, "mesher.layers": None, "mesher.notch_nodes": "middle",
+}
+_HEX20: dict[str, Any] = {**_HEX8, "mesher.order": 2}
+_QUARTER: dict[str, Any] = {**_HEX20, "mesher.layers": 2, "mesher.notch_nodes": "quarter"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,9 +137,8 @@ def _graded(
     settings = {
         "mesher": "swept", "mesher.order": order, "mesher.size_mm": size, "mesher.layers": layers,
         "mesher.least_edges": least, "mesher.grading": grading,
+        "mesher.notch_nodes": "quarter" if order == 2 else "middle",
     }
-    if order == 2:
-        settings["mesher.notch_nodes"] = "quarter"
     return f"{element} {size:g} mm graded, {least} through a wall", settings
 
 
@@ -167,9 +169,11 @@ def _all_rungs() -> list[Rung]:
 
 
 def _sizes() -> list[Rung]:
+    graded = {**_QUARTER, "mesher.grading": 1.5}
     families: tuple[tuple[str, str, dict[str, Any], Sequence[float]], ...] = (
-        ("size", "hex8", _HEX8, (8, 6, 4, 3, 2, 1.5, 1)), ("element", "hex20", _HEX20, (8, 6, 4, 3, 2)),
-        ("element", "hex20, quarter nodes", _QUARTER, (6, 4, 3, 2.5, 2, 1.5)),
+        ("size", "hex20, quarter nodes", _QUARTER, (6, 4, 3, 2.5, 2, 1.5)),
+        ("element", "hex20, quarter nodes, graded", graded, (6, 4, 3, 2.5, 2, 1.5)),
+        ("element", "hex20", _HEX20, (8, 6, 4, 3, 2)), ("element", "hex8", _HEX8, (8, 6, 4, 3, 2, 1.5, 1)),
         ("element", "tet10", _TET10, (8, 6, 4, 3, 2, 1.5)), ("element", "tet4", _TET4, (6, 4, 3, 2, 1.5, 1)),
         ("element", "hex8, two through a wall", {**_HEX8, "mesher.least_edges": 2}, (6, 4, 3, 2)),
     )
@@ -178,8 +182,9 @@ def _sizes() -> list[Rung]:
         for knob, family, settings, sizes in families for size in sizes
     ]
     layers = [
-        _rung("element", "layers of hex8", f"hex8 4 mm, {n} layers", {**_HEX8, "mesher.size_mm": 4, "mesher.layers": n})
-        for n in (2, 3, 6)
+        _rung("element", f"layers of {size:g} mm", f"hex20, quarter nodes {size:g} mm, {n} layers",
+              {**_QUARTER, "mesher.size_mm": size, "mesher.layers": n})
+        for size in (2.5, 4.0) for n in (1, 2, 3, 4) if (size, n) not in ((2.5, 2), (4.0, 2))
     ]
     known = {"swept", "tetrahedral"}
     return rungs + layers + [
@@ -255,4 +260,6 @@ def _require_backend(rung: Rung) -> None:
 
 
 def _plain(value: Any) -> str:
+    if value is None:
+        return "null"
     return f"{value:g}" if isinstance(value, float) else str(value)

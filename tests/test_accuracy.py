@@ -206,9 +206,13 @@ def test_a_row_says_what_was_run_and_with_what(study_in, tmp_path):
     study.set_reference("compute")
     study.run([rung for rung in study.rungs if rung.name == "hex8 2 mm"])
     row = read_rows(tmp_path / LOG)[-1]
-    assert row["settings"] == {"mesher": "swept", "mesher.size_mm": 2} and row["knob"] == "size"
+    settings = {"mesher": "swept", "mesher.order": 1, "mesher.layers": None, "mesher.notch_nodes": "middle"}
+    assert row["settings"] == {**settings, "mesher.size_mm": 2} and row["knob"] == "element"
     assert row["versions"]["finqd"] and row["machine"]["cores"] >= 1 and row["status"] == "ok"
-    assert row["options"] == "--preset standard --set mesher=swept --set mesher.size_mm=2"
+    assert row["options"] == (
+        "--preset standard --set mesher=swept --set mesher.order=1 --set mesher.layers=null "
+        "--set mesher.notch_nodes=middle --set mesher.size_mm=2"
+    )
     assert row["design_digest"] == study.runner.ran[-1].digest() != study.design.digest()
     exact = study.reference.values["force_N"]
     assert row["errors"]["force_N"] == pytest.approx(100 * (row["values"]["force_N"] / exact - 1))
@@ -444,7 +448,7 @@ def test_table_picture_and_page(study_in, tmp_path):
     coarse = by_name["hex8 8 mm"]
     exact = study.reference.values["force_N"]
     assert float(coarse["error_percent"]) == pytest.approx(100 * (EXACT * 1.642 / exact - 1), rel=1e-6)
-    assert float(coarse["change_percent"]) == pytest.approx(100 * (1.642 / 1.162 - 1), rel=1e-6)
+    assert float(coarse["change_percent"]) == pytest.approx(100 * (1.642 / 1.03325 - 1), rel=1e-6)
     assert (coarse["dofs"], coarse["steps"], coarse["newton_iterations"]) == ("1125", "60", "120")
     assert float(coarse["max_penetration_mm"]) == 0.004 and coarse["options"].endswith("mesher.size_mm=8")
     failed = by_name["contact stiffness_N_mm3 3000"]
@@ -504,13 +508,13 @@ def test_the_command_runs_a_ladder_and_answers_from_it(run, tmp_path, monkeypatc
     monkeypatch.setattr("finqd.accuracy.open_study", without_processes)
     command = ["accuracy", "--reference", "compute", "--out", tmp_path, "--knob", "size"]
     code, out, said = run(*command)
-    assert code == 0 and "hex8 2 mm" in out and "on the Pareto front" in out and "the limit of hex8" in out
+    assert code == 0 and "hex20, quarter nodes 2 mm" in out and "on the Pareto front" in out and "the limit of hex8" in out
     assert {path.name for path in tmp_path.iterdir()} == {
         LOG, REFERENCE, "accuracy.csv", "accuracy.png", "accuracy.html"
     }
-    code, out, said = run(*command, "--error", "20%", "--budget", "1.5s")
-    assert code == 0 and "error up to 20 %: standard, " in out and "at most 1.5 s: hex8 3 mm, " in out
-    assert "    --preset standard --set mesher=swept --set mesher.size_mm=" in out
+    code, out, said = run(*command, "--error", "3%", "--budget", "4s")
+    assert code == 0 and "error up to 3 %: standard, " in out and "at most 4 s: hex20, quarter nodes 4 mm, " in out
+    assert "    --preset standard --set mesher=swept --set mesher.order=2 --set mesher.layers=2" in out
     code, out, said = run(*command, "--error", "0.001%")
     assert code == 1 and "no rung of this ladder does (--full has more); the most accurate is" in out
 
