@@ -150,6 +150,7 @@ def test_gradient_is_that_of_the_energy(case: str) -> None:
 def test_hessian_is_that_of_the_gradient(case: str) -> None:
     system = make(case)
     state = contacting(system)
+    system.contact.rows.curve[:] = np.nan  # what other contacts left there must not matter
     assert hessian_error(system, state, hessian(system, state)) < 2e-5
 
 

@@ -192,6 +192,7 @@ class PenaltyContact:
         self._find(state)
         rows, f = self.rows, self.friction
         if exact:
+            rows.curve[: rows.count] = 0.0  # planes have none
             for r, field in enumerate(self.fields):
                 kernels.find_curvatures(
                     field, np.ascontiguousarray(state.rigid_rotations[r]), r, rows.rigid, rows.turns, rows.gap,
