@@ -20,8 +20,6 @@ LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of w
 LAG_CHANGE = 0.5  # share of the friction bounds, in sum, that may miss Coulomb's law at the end of a step
 PATIENCE = 4  # times as many renewals are granted before what they leave makes the step fail
 EARLY = 100.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
-FORCING = 0.1  # share of the step's tolerance that a linear solve may leave,
-LOOSEST = 0.1  # but never more than this share of the residual
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
 
@@ -154,12 +152,8 @@ class Newton:
 
     def _solve(self) -> LinearSolution:
         d = self.system.derivatives
-        # near the end the rest may be left to the tolerance of the step (an inexact Newton method; Eisenstat and
-        # Walker, SIAM J. Sci. Comput. 17 (1996) 16)
-        enough = min(FORCING * self.options.tolerance_N / max(self.report.residual, 1e-300), LOOSEST)
         solution = self.options.solver(self.system).solve(
-            d.blocks, d.coupling, d.rigid_matrix, -d.soft, -d.rigid,
-            tolerance=max(self.options.linear_tolerance, enough),
+            d.blocks, d.coupling, d.rigid_matrix, -d.soft, -d.rigid, tolerance=self.options.linear_tolerance
         )
         self.report.cg_iterations += solution.iterations
         self.report.factorisations += int(solution.factorised)
