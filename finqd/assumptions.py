@@ -77,7 +77,7 @@ ASSUMPTIONS = (
     "slivers of a hole with less than 1e-4 mm^2 are filled",
     "features are the gripper's as built: the pads that an export adds are in none of them",
     "objects are rigid; a rigid body's inertia is taken at the start of a step, so fast tumbling gains some energy",
-    "where fingers touch them, sharp edges of objects count as rounded (contact.edge_radius_mm, less if they are fine)",
+    "where fingers touch, sharp edges of objects count as rounded (contact.edge_radius_mm; less, or not, on fine ones)",
     "the mount is rigid: each finger base is driven as a whole",
     "each finger's drive stalls by itself when the sum of the normal contact forces on that finger reaches its limit",
     "the object starts at rest on the floor, centred under the gripper",

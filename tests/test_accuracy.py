@@ -508,7 +508,8 @@ def test_the_command_runs_a_ladder_and_answers_from_it(run, tmp_path, monkeypatc
     monkeypatch.setattr("finqd.accuracy.open_study", without_processes)
     command = ["accuracy", "--reference", "compute", "--out", tmp_path, "--knob", "size"]
     code, out, said = run(*command)
-    assert code == 0 and "hex20, quarter nodes 2 mm" in out and "on the Pareto front" in out and "the limit of hex8" in out
+    assert code == 0 and "hex20, quarter nodes 2 mm" in out and "on the Pareto front" in out
+    assert "the limit of hex8" in out
     assert {path.name for path in tmp_path.iterdir()} == {
         LOG, REFERENCE, "accuracy.csv", "accuracy.png", "accuracy.html"
     }

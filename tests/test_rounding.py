@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from shapely.geometry import Point, Polygon
 
 from finqd.mechanics.distance_kernels import distance_curvature, signed_distance
 from finqd.mechanics.rounding import rounded_field
+from finqd.object_shapes import solid_in_surface
 from finqd.objects import load_object, object_names
 from finqd.units import MM
 
@@ -120,3 +122,81 @@ def test_an_inner_edge_of_a_polyhedron_stays_where_it_is() -> None:
     inner = np.array([8.0, 8.0, 0.0]) * MM + item.vertices[0] - np.array([0.0, 0.0, -10.0]) * MM
     assert field.radius == RADIUS
     assert abs(signed_distance(field, *inner)[0]) < 1e-9
+
+
+def test_sharp_tips_are_rounded_by_less_rather_than_not_at_all() -> None:
+    corners = [[x, y, z] for y in (-10, 10) for x, z in ((0, 0), (20, 2), (20, -2))]
+    wedge = made({"kind": "polyhedron", "vertices_mm": corners})
+    knife = made({"kind": "revolution", "profile_mm": [[0, -1], [15, 0], [0, 1]]})
+    for item in (wedge, knife):
+        field = rounded_field(item, RADIUS)
+        assert 0.0 < field.radius < RADIUS
+        assert max(signed_distance(field, *corner)[0] for corner in item.vertices) < 5 * RADIUS
+
+
+def test_a_triangle_without_area_changes_nothing() -> None:
+    corners = np.array([[x, y, z] for x in (-10, 10) for y in (-8, 8) for z in (-6, 6)]) * MM
+    hull = trimesh.convex.convex_hull(corners)
+    a, b = next(
+        (i, j) for i, j in hull.edges_unique
+        if np.count_nonzero(np.abs(hull.vertices[i] - hull.vertices[j]) > 1e-9) == 1
+    )
+    vertices = np.vstack([hull.vertices, hull.vertices[[a, b]].mean(axis=0)])
+    triangles, middle, cut = [], len(hull.vertices), False
+    for face in hull.faces.tolist():
+        k = next((k for k in range(3) if {face[k], face[(k + 1) % 3]} == {a, b}), None)
+        if k is None or cut:
+            triangles.append(face)
+            continue
+        one, two, third = face[k], face[(k + 1) % 3], face[(k + 2) % 3]
+        triangles += [[one, middle, third], [middle, two, third], [one, two, middle]]
+        cut = True
+    item = solid_in_surface(vertices, np.array(triangles))
+    field = rounded_field(item, RADIUS)
+    assert field.radius == RADIUS
+    plain = rounded_field(made({"kind": "box", "size_mm": [20, 16, 12]}), RADIUS)
+    for point in near_surface(made({"kind": "box", "size_mm": [20, 16, 12]}), plain, 100, 0.8 * RADIUS):
+        assert signed_distance(field, *point)[0] == pytest.approx(signed_distance(plain, *point)[0], abs=1e-9)
+
+
+def test_a_smaller_surface_that_would_cross_itself_is_refused() -> None:
+    """Two V-shaped cavities, whose ridges pass each other crosswise 0.4 mm apart; no vertex is near."""
+    def cavity(along: int, tip: float, back: float) -> trimesh.Trimesh:
+        points = np.zeros((6, 3))
+        for k, end in enumerate((-7.0, 7.0)):
+            points[3 * k : 3 * k + 3, along] = end
+            points[3 * k : 3 * k + 3, 2] = (tip, back, back)
+            points[3 * k : 3 * k + 3, 1 - along] = (0.0, 2.0, -2.0)
+        mesh = trimesh.convex.convex_hull(points)
+        mesh.invert()
+        return mesh
+
+    body = trimesh.util.concatenate([trimesh.creation.box((20, 20, 20)), cavity(0, -0.2, -4), cavity(1, 0.2, 4)])
+    item = solid_in_surface(body.vertices * MM, body.faces)
+    field = rounded_field(item, RADIUS)
+    assert 0.0 < field.radius < RADIUS
+    rng = np.random.default_rng(3)
+    for point in rng.uniform(-9, 9, (3000, 3)) * MM:
+        sharp = signed_distance(item.distance, *point)[0]
+        assert signed_distance(field, *point)[0] >= sharp - 0.5 * field.radius
+
+
+def test_a_groove_is_not_filled() -> None:
+    grooved = made({
+        "kind": "revolution",
+        "profile_mm": [[0, -9], [12, -9], [12, -0.4], [5, -0.4], [5, 0.4], [12, 0.4], [12, 9], [0, 9]],
+    })
+    field = rounded_field(grooved, RADIUS)
+    assert signed_distance(field, 9 * MM, 0.0, 0.0)[0] == pytest.approx(0.4 * MM, rel=1e-6)
+    assert signed_distance(field, 5.1 * MM, 0.0, 0.0)[0] > 0.0
+
+
+def test_an_edge_between_triangles_of_one_plane_bends_nothing() -> None:
+    box, found = made({"kind": "box", "size_mm": [20, 20, 12]}), np.empty((3, 3))
+    rod = made({"kind": "revolution", "profile_mm": [[0, -6], [10, -6], [10, 6], [0, 6]]})
+    for item in (box, rod):
+        field = rounded_field(item, RADIUS)
+        for point in ((0.0, 0.0, 5.9 * MM), (3 * MM, 3 * MM, 5.9 * MM), (3 * MM, -3 * MM, 5.9 * MM)):
+            d, *n = signed_distance(field, *point)
+            distance_curvature(field, d, *point, np.array(n), found)
+            assert np.array_equal(found, np.zeros((3, 3)))

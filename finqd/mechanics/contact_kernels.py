@@ -31,7 +31,7 @@ def face_point(positions, nodes, weight, point):
 
 @njit(cache=True)
 def face_box(positions, nodes, low, high):
-    """Write a box that holds all points of a face: its vertices' box, grown by an eighth for faces that bulge [m]."""
+    """Write the box of a face's vertices [m]; it holds all points of the face, whose weights are shares."""
     for i in range(3):
         low[i], high[i] = np.inf, -np.inf
         for a in range(nodes.shape[0]):
@@ -39,10 +39,6 @@ def face_box(positions, nodes, low, high):
             if n >= 0:
                 low[i] = min(low[i], positions[n, i])
                 high[i] = max(high[i], positions[n, i])
-    grow = 0.125 * max(high[0] - low[0], high[1] - low[1], high[2] - low[2])
-    for i in range(3):
-        low[i] -= grow
-        high[i] += grow
 
 
 @njit(cache=True)

@@ -19,7 +19,7 @@ class ContactSurface:
         shape (n_faces,)
     face_lattice: which lattice of samples a face has, shape (n_faces,); lattice l has the rows lattice_first[l] to
         lattice_first[l + 1] of lattice_weight (n, k), a sample's weights of the face's vertices, and of lattice_share
-        (n,), its share of the area
+        (n,), its share of the area (exact where a face's own coordinates stretch evenly, not beside quarter nodes)
     first_sample: numbers of the samples of face f, first_sample[f] to first_sample[f + 1], shape (n_faces + 1,)
     """
 
@@ -111,7 +111,10 @@ def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
 
 
 def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSurface:
-    """Return the surface of ``bodies`` with samples at most ``spacing`` [m] apart; faces that are held are left out."""
+    """Return the surface of ``bodies`` with samples about ``spacing`` [m] apart, at most on faces that stretch evenly.
+
+    Faces that are held are left out.
+    """
     width = max((f.shape[1] for body in bodies for f in body.mesh.faces.values() if len(f)), default=4)
     lattices: dict[tuple[str, int, int], int] = {}
     weights, shares = [np.zeros((0, width))], [np.zeros(0)]

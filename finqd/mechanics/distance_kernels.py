@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 SPHERE, REVOLUTION, SURFACE = 0, 1, 2
+SAME = 1e-9  # normals that differ by less are one
 TOUCHING = 1e-12  # below this distance [m] the direction to the closest point is rounding noise
 
 #: kind: SPHERE, REVOLUTION or SURFACE
@@ -261,8 +262,11 @@ def distance_curvature(field, d, x, y, z, n, out):
         t0, t1, bend = 0.0, 1.0, 0.0
         if r > TOUCHING:
             t0, t1, bend = -y / r, x / r, (n[0] * x + n[1] * y) / (r * r)
-        _, along = _closest_segment(field.rows, r, z)
+        i, along = _closest_segment(field.rows, r, z)
         corner = 1.0 / e if (along == 0.0 or along == 1.0) and e > TOUCHING else 0.0
+        outwards = (n[0] * x + n[1] * y) / r if r > TOUCHING else 0.0
+        if abs(outwards - field.rows[i, 5]) + abs(n[2] - field.rows[i, 6]) < SAME:
+            corner = 0.0  # where two sides of the profile go straight on, and on the axis
         s = (t1 * n[2], -t0 * n[2], t0 * n[1] - t1 * n[0])
         t = (t0, t1, 0.0)
         for i in range(3):
@@ -275,7 +279,8 @@ def distance_curvature(field, d, x, y, z, n, out):
     if field.kind == SURFACE:
         slot = _closest_slot(field.rows, field.boxes, field.leaf_size, x, y, z)
         _, _, feature = _closest_parameters(field.rows, slot, x, y, z)
-        if feature == 0:
+        turn = abs(n[0] - field.rows[slot, 9]) + abs(n[1] - field.rows[slot, 10]) + abs(n[2] - field.rows[slot, 11])
+        if feature == 0 or turn < SAME:  # over a face, or an edge between triangles of one plane
             return
     for i in range(3):
         for j in range(3):

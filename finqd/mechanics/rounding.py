@@ -4,17 +4,19 @@ A rounded body is the smaller body that a ball's centre can reach inside the sha
 morphological opening; J. Serra, Image Analysis and Mathematical Morphology, 1982, ch. 2). Faces stay where they are.
 Its distance is that from the smaller body less the radius, whose gradient is continuous down to a depth of the radius:
 the distance from the sharp body jumps there from one face of an edge to the other. The inner edges of a solid of
-revolution are rounded alike; those of a polyhedron stay sharp.
+revolution are rounded alike where that fills little; steeper ones, and those of a polyhedron, stay sharp.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
 
 from finqd.mechanics.distance import (
     corner_angles,
+    edge_table,
     revolution_field,
     surface_field,
     triangle_neighbours,
@@ -23,7 +25,9 @@ from finqd.mechanics.distance import (
 from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, DistanceField, signed_distances
 
 HALVINGS = 5  # a body too fine for the radius asked for is rounded by a half, a quarter, ... of it, or not at all
-RECESS = 4.0  # a tip may lie back by this multiple of the radius
+RECESS = 4.0  # a tip may lie back by this multiple of the radius asked for
+FILL = 1.0  # and an inner edge of a lathe be filled by this multiple of the radius; beyond, it stays sharp
+MITRE = 20.0  # length of a sharp corner of a profile, in multiples of the radius, before it is cut
 ARC = 64  # pieces of a quarter circle
 SHORTEST = 1e-7  # shorter sides of a profile are rounding noise [m]
 OFF = 0.05  # how far a point of the smaller body may miss its depth, as a share of the radius
@@ -42,62 +46,84 @@ class Solid(Protocol):
 def rounded_field(solid: Solid, radius: float) -> DistanceField:
     """Return the distance field of ``solid`` with convex edges rounded by ``radius`` [m], or by less where it is fine.
 
-    The field's ``radius`` says by how much. 0, and balls, leave it as it is.
+    The field's ``radius`` says by how much: half, a quarter, ... down to a 16th, or 0 for a body finer than that (a
+    noisy scan). 0, and balls, leave the field as it is.
     """
-    if solid.distance.kind == SPHERE:
+    if solid.distance.kind == SPHERE or radius <= 0.0:
         return solid.distance
-    smaller = _smaller_lathe if solid.distance.kind == REVOLUTION else _smaller_surface
-    for halving in range(HALVINGS if radius > 0.0 else 0):
-        found = smaller(solid, radius * 0.5**halving)
+    smaller = _smaller_lathes(solid, radius) if solid.distance.kind == REVOLUTION else _smaller_surfaces(solid, radius)
+    for tried, found in smaller:
         if found is not None:
-            return found._replace(radius=radius * 0.5**halving)
+            return found._replace(radius=tried)
     return solid.distance
 
 
-def _smaller_lathe(solid: Solid, radius: float) -> DistanceField | None:
-    """Return the field of the solid of revolution whose profile lies ``radius`` inside; None if it is too fine."""
-    from shapely import MultiPoint, Polygon, box, orient_polygons, remove_repeated_points, union
+def _radii(radius: float) -> list[float]:
+    return [radius * 0.5**halving for halving in range(HALVINGS)]
+
+
+def _smaller_lathes(solid: Solid, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
+    """Yield each radius to try and the field of the lathe whose profile lies that far inside, None if too fine."""
+    from shapely import MultiPoint, Polygon, box, remove_repeated_points, union
+    from shapely.geometry.polygon import orient
 
     profile = solid.profile
-    whole = Polygon(profile)
+    whole, corners = Polygon(profile), MultiPoint(profile).geoms
     if np.any(profile[:, 0] == 0.0):  # the axis is no side of the solid
         whole = union(whole, Polygon(profile * [-1.0, 1.0]))
-    inside = whole.buffer(radius, quad_segs=ARC).buffer(-2.0 * radius, quad_segs=ARC)
     far = 2.0 * float(np.abs(profile).max())
-    half = remove_repeated_points(inside.intersection(box(0.0, -far, far, far)), SHORTEST)
-    if half.geom_type != "Polygon" or half.is_empty or half.interiors:
-        return None
-    if any(half.distance(point) > (1.0 + RECESS) * radius for point in MultiPoint(profile).geoms):
-        return None
-    corners = np.array(orient_polygons(half).exterior.coords)[:-1]
-    corners[np.abs(corners[:, 0]) < 1e-12, 0] = 0.0
-    return revolution_field(corners)
+    for radius in _radii(asked):
+        closed = whole.buffer(radius, quad_segs=ARC)
+        inside = closed.buffer(-2.0 * radius, quad_segs=ARC)
+        filled = closed.exterior.distance
+        if any(filled(corner) - radius > FILL * radius and closed.contains(corner) for corner in corners):
+            inside = whole.buffer(-radius, join_style="mitre", mitre_limit=MITRE)
+        half = remove_repeated_points(inside.intersection(box(0.0, -far, far, far)), SHORTEST)
+        found = None
+        simple = half.geom_type == "Polygon" and not half.is_empty and not half.interiors
+        if simple and all(half.distance(corner) <= radius + RECESS * asked for corner in corners):
+            points = np.array(orient(half, 1.0).exterior.coords)[:-1]
+            points[np.abs(points[:, 0]) < 1e-12, 0] = 0.0
+            found = revolution_field(points)
+        yield radius, found
 
 
-def _smaller_surface(solid: Solid, radius: float) -> DistanceField | None:
-    """Return the field of the surface ``radius`` inside another; None if that surface is too fine for it.
+def _smaller_surfaces(solid: Solid, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
+    """Yield each radius to try and the field of the surface that far inside; None if the body is too fine for it.
 
     Each vertex goes to where its faces, moved inwards by the radius, meet (in the sense of least squares if they are
-    more than three): v - r m with n_i . m = 1.
+    more than three): v - r m with n_i . m = 1. The surface must not have come too near to the body's own anywhere.
     """
     vertices, triangles = solid.vertices, solid.triangles
     topology = triangle_neighbours(triangles)
     normals, flat = triangle_normals(vertices, triangles, topology[1])
-    weight = np.where(flat[:, None], 0.0, corner_angles(vertices, triangles))
+    weight = corner_angles(vertices, triangles)
     matrix, right = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))
     outer = normals[:, :, None] * normals[:, None, :]
     for corner in range(3):
         np.add.at(matrix, triangles[:, corner], weight[:, corner, None, None] * outer)
         np.add.at(right, triangles[:, corner], weight[:, corner, None] * normals)
     move = np.einsum("nij,nj->ni", np.linalg.pinv(matrix, rcond=FLAT**2, hermitian=True), right)
-    inner = vertices - radius * move
-    length = np.linalg.norm(move, axis=1)
-    distance = np.empty(len(inner))
-    signed_distances(solid.distance, inner, distance, np.empty_like(inner))
-    used = np.unique(triangles)
-    if np.any(distance[used] > (OFF - 1.0) * radius) or np.any(length[used] > 1.0 + RECESS):
-        return None
-    turned, _ = triangle_normals(inner, triangles, topology[1])
-    if np.any(np.einsum("ij,ij->i", turned, normals)[~flat] < 0.9):
-        return None
-    return surface_field(inner, triangles, topology=topology)
+    back = float(np.linalg.norm(move[np.unique(triangles)], axis=1).max())
+    edges = edge_table(triangles)[0]
+    for radius in _radii(asked):
+        found = None
+        if back * radius <= radius + RECESS * asked:
+            inner = vertices - radius * move
+            turned, _ = triangle_normals(inner, triangles, topology[1])
+            straight = np.all(np.einsum("ij,ij->i", turned, normals)[~flat] >= 0.9)
+            if straight and _depth(solid.distance, inner, edges, 0.5 * radius) >= (1.0 - OFF) * radius:
+                found = surface_field(inner, triangles, topology=topology)
+        yield radius, found
+
+
+def _depth(distance: DistanceField, inner: np.ndarray, edges: np.ndarray, spacing: float) -> float:
+    """Return the least depth [m] of points at most ``spacing`` [m] apart on the edges of the smaller surface."""
+    ends = inner[edges]
+    pieces = np.maximum(np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / spacing).astype(int), 1)
+    share = np.concatenate([np.arange(n) / n for n in pieces])[:, None]
+    points = np.repeat(ends[:, 0], pieces, axis=0) * (1.0 - share) + np.repeat(ends[:, 1], pieces, axis=0) * share
+    points = np.concatenate([points, inner[np.unique(edges)]])
+    distances = np.empty(len(points))
+    signed_distances(distance, points, distances, np.empty_like(points))
+    return float(-distances.max())

@@ -40,7 +40,7 @@ class Penalty:
 
     stiffness_N_mm3: Annotated[float, Gt(0), Le(1e6)] = 300.0
     smoothing_mm: Annotated[float, Gt(0), Le(1)] = 0.01
-    sample_spacing_mm: Annotated[float, Gt(0), Le(20)] = 0.3
+    sample_spacing_mm: Annotated[float, Ge(0.02), Le(20)] = 0.3
     edge_radius_mm: Annotated[float, Ge(0), Le(10)] = 0.5
     friction_stiffness_ratio: Annotated[float, Gt(0), Le(10)] = 0.5
     step_allowance_mm: Annotated[float, Gt(0), Le(10)] = 0.5
