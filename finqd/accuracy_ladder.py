@@ -31,7 +31,7 @@ NUMERICAL_CONSTANTS = ("time_step_ms", "wall_clock_limit_s")
 
 _TET4: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 1}
 _TET10: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 2}
-#: whatever the preset says of the swept mesher
+#: in full: what a rung leaves open, the preset fills with its own options
 _HEX8: dict[str, Any] = {
     "mesher": "swept", "mesher.order": 1, "mesher.layers": None, "mesher.notch_nodes": "middle",
 }

@@ -18,8 +18,8 @@ class ContactSurface:
     faces: vertex ids, -1 pads, shape (n_faces, k); face_body: soft body of each face, face_area: at rest [m^2], both of
         shape (n_faces,)
     face_lattice: which lattice of samples a face has, shape (n_faces,); lattice l has the rows lattice_first[l] to
-        lattice_first[l + 1] of lattice_weight (n, k), a sample's weights of the face's vertices, and of lattice_share
-        (n,), its share of the area (exact where a face's own coordinates stretch evenly, not beside quarter nodes)
+        lattice_first[l + 1] of lattice_weight (n, k), a sample's weights of the face's vertices. All samples of a face
+        stand for equal areas, which is exact where its own coordinates stretch evenly, not beside quarter nodes
     first_sample: numbers of the samples of face f, first_sample[f] to first_sample[f + 1], shape (n_faces + 1,)
     """
 
@@ -29,7 +29,6 @@ class ContactSurface:
     face_lattice: np.ndarray
     lattice_first: np.ndarray
     lattice_weight: np.ndarray
-    lattice_share: np.ndarray
     first_sample: np.ndarray
 
     @property
@@ -41,24 +40,21 @@ class ContactSurface:
     def arrays(self) -> tuple[np.ndarray, ...]:
         """What kernels take, in their order."""
         return (
-            self.faces, self.face_area, self.face_lattice, self.lattice_first, self.lattice_weight, self.lattice_share,
-            self.first_sample,
+            self.faces, self.face_area, self.face_lattice, self.lattice_first, self.lattice_weight, self.first_sample,
         )
 
 
-def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return local points (p, 2) in the middles of n by m cells (n by n for a triangle) and their shares of the area.
+def lattice(face_type: str, n: int, m: int) -> np.ndarray:
+    """Return local points (p, 2) in the middles of n by m equal cells (n by n for a triangle).
 
     None lies on the face's rim: where a body stands on a face, the faces beside that one would push along.
     """
     if face_type.startswith("quad"):
         u, v = ((2.0 * np.arange(cells) + 1.0) / cells - 1.0 for cells in (n, m))
-        points = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
-    else:
-        upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
-        turned = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
-        points = np.array(upright + turned) / n
-    return points, np.full(len(points), 1.0 / len(points))
+        return np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
+    turned = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
+    return np.array(upright + turned) / n
 
 
 def contact_shape(face_type: str, xi: np.ndarray) -> np.ndarray:
@@ -88,14 +84,14 @@ def contact_shape(face_type: str, xi: np.ndarray) -> np.ndarray:
     return face_shape(face_type, xi)
 
 
-def _face_vectors(points: np.ndarray, face_type: str) -> np.ndarray:
-    """Return area times unit normal of each face [m^2], shape (n_faces, 3)."""
+def _areas(points: np.ndarray, face_type: str) -> np.ndarray:
+    """Return the area of each face, from its corners [m^2], shape (n_faces,)."""
     corners = points[:, : 4 if face_type.startswith("quad") else 3]
     if corners.shape[1] == 3:
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     else:
         cross = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    return 0.5 * cross
+    return 0.5 * np.linalg.norm(cross, axis=1)
 
 
 def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
@@ -117,7 +113,7 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
     """
     width = max((f.shape[1] for body in bodies for f in body.mesh.faces.values() if len(f)), default=4)
     lattices: dict[tuple[str, int, int], int] = {}
-    weights, shares = [np.zeros((0, width))], [np.zeros(0)]
+    weights = [np.zeros((0, width))]
     faces, owner, area, which = [np.zeros((0, width), dtype=np.int64)], [], [], []
     for number, body in enumerate(bodies):
         for kind in sorted(body.mesh.faces):
@@ -128,20 +124,18 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
             points = body.mesh.vertices[block]
             faces.append(_padded(block + body.first_vertex, width, -1))
             owner.append(np.full(len(block), number))
-            area.append(np.linalg.norm(_face_vectors(points, kind), axis=1))
+            area.append(_areas(points, kind))
             for n, m in _cells(points, kind, spacing):
                 if (kind, n, m) not in lattices:
                     lattices[kind, n, m] = len(lattices)
-                    local, share = lattice(kind, int(n), int(m))
-                    weights.append(_padded(contact_shape(kind, local), width, 0.0))
-                    shares.append(share)
+                    weights.append(_padded(contact_shape(kind, lattice(kind, int(n), int(m))), width, 0.0))
                 which.append(lattices[kind, n, m])
-    first = np.cumsum([0] + [len(share) for share in shares[1:]])
+    first = np.cumsum([len(rows) for rows in weights])
     face_lattice = np.array(which, dtype=np.int64)
     return ContactSurface(
         faces=np.concatenate(faces), face_body=np.concatenate([np.zeros(0, dtype=np.int64), *owner]),
         face_area=np.concatenate([np.zeros(0), *area]), face_lattice=face_lattice, lattice_first=first,
-        lattice_weight=np.concatenate(weights), lattice_share=np.concatenate(shares),
+        lattice_weight=np.concatenate(weights),
         first_sample=np.concatenate([[0], np.cumsum(np.diff(first)[face_lattice])]).astype(np.int64),
     )
 

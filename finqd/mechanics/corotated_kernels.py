@@ -258,6 +258,25 @@ def _products(a, b, out):
 
 
 @njit(cache=True)
+def _without_moment(e, rest, gradients, q_columns, out):
+    """Write Q~ = Q - Omega^T lambda, the columns of Q without their moment about the rest shape, shape (3, 3k)."""
+    k = gradients.shape[1]
+    for i in range(3):
+        zx, zy, zz = 0.0, 0.0, 0.0
+        for a in range(k):
+            x0, x1, x2 = rest[e, a, 0], rest[e, a, 1], rest[e, a, 2]
+            q0, q1, q2 = q_columns[i, 3 * a], q_columns[i, 3 * a + 1], q_columns[i, 3 * a + 2]
+            zx += 0.5 * (x1 * q2 - x2 * q1)
+            zy += 0.5 * (x2 * q0 - x0 * q2)
+            zz += 0.5 * (x0 * q1 - x1 * q0)
+        for a in range(k):
+            gx, gy, gz = gradients[e, a, 0], gradients[e, a, 1], gradients[e, a, 2]
+            out[i, 3 * a] = q_columns[i, 3 * a] + gy * zz - gz * zy
+            out[i, 3 * a + 1] = q_columns[i, 3 * a + 1] + gz * zx - gx * zz
+            out[i, 3 * a + 2] = q_columns[i, 3 * a + 2] + gx * zy - gy * zx
+
+
+@njit(cache=True)
 def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, small):
     """Change W (3, 3) [J] (and Q, rarely) so that the element's Hessian becomes positive semidefinite.
 
@@ -270,20 +289,7 @@ def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, smal
     compliance: K^+ [m/N], (n, 3k, 3k); q_columns: rows are the columns of Q, (3, 3k)
     rigid, kq: scratch (3, 3k); small: scratch (2, 3, 3)
     """
-    k = gradients.shape[1]
-    for i in range(3):
-        zx, zy, zz = 0.0, 0.0, 0.0
-        for a in range(k):
-            x0, x1, x2 = rest[e, a, 0], rest[e, a, 1], rest[e, a, 2]
-            q0, q1, q2 = q_columns[i, 3 * a], q_columns[i, 3 * a + 1], q_columns[i, 3 * a + 2]
-            zx += 0.5 * (x1 * q2 - x2 * q1)
-            zy += 0.5 * (x2 * q0 - x0 * q2)
-            zz += 0.5 * (x0 * q1 - x1 * q0)
-        for a in range(k):
-            gx, gy, gz = gradients[e, a, 0], gradients[e, a, 1], gradients[e, a, 2]
-            rigid[i, 3 * a] = q_columns[i, 3 * a] + gy * zz - gz * zy
-            rigid[i, 3 * a + 1] = q_columns[i, 3 * a + 1] + gz * zx - gx * zz
-            rigid[i, 3 * a + 2] = q_columns[i, 3 * a + 2] + gx * zy - gy * zx
+    _without_moment(e, rest, gradients, q_columns, rigid)
     _times_three(compliance, e, rigid, kq)
     w3, v = small[0], small[1]
     _products(rigid, kq, w3)
@@ -303,7 +309,7 @@ def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, smal
     if trace > limit:  # never so where the element is semidefinite already
         share = math.sqrt(limit / trace)
         for i in range(3):
-            for n in range(3 * k):
+            for n in range(q_columns.shape[1]):
                 q_columns[i, n] *= share
     for i in range(3):
         for j in range(i + 1):

@@ -34,7 +34,7 @@ OFF = 0.05  # how far a point of the smaller body may miss its depth, as a share
 FLAT = 0.02  # share of the largest below which a direction is not held by the faces at a vertex
 
 
-class Solid(Protocol):
+class RigidShape(Protocol):
     """What rounding looks at: a `GraspObject` has it."""
 
     distance: DistanceField
@@ -43,7 +43,7 @@ class Solid(Protocol):
     profile: np.ndarray | None
 
 
-def rounded_field(solid: Solid, radius: float) -> DistanceField:
+def rounded_field(solid: RigidShape, radius: float) -> DistanceField:
     """Return the distance field of ``solid`` with convex edges rounded by ``radius`` [m], or by less where it is fine.
 
     The field's ``radius`` says by how much: half, a quarter, ... down to a 16th, or 0 for a body finer than that (a
@@ -62,7 +62,7 @@ def _radii(radius: float) -> list[float]:
     return [radius * 0.5**halving for halving in range(HALVINGS)]
 
 
-def _smaller_lathes(solid: Solid, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
+def _smaller_lathes(solid: RigidShape, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
     """Yield each radius to try and the field of the lathe whose profile lies that far inside, None if too fine."""
     from shapely import MultiPoint, Polygon, box, remove_repeated_points, union
     from shapely.geometry.polygon import orient
@@ -88,7 +88,7 @@ def _smaller_lathes(solid: Solid, asked: float) -> Iterator[tuple[float, Distanc
         yield radius, found
 
 
-def _smaller_surfaces(solid: Solid, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
+def _smaller_surfaces(solid: RigidShape, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
     """Yield each radius to try and the field of the surface that far inside; None if the body is too fine for it.
 
     Each vertex goes to where its faces, moved inwards by the radius, meet (in the sense of least squares if they are
@@ -121,7 +121,8 @@ def _depth(distance: DistanceField, inner: np.ndarray, edges: np.ndarray, spacin
     """Return the least depth [m] of points at most ``spacing`` [m] apart on the edges of the smaller surface."""
     ends = inner[edges]
     pieces = np.maximum(np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / spacing).astype(int), 1)
-    share = np.concatenate([np.arange(n) / n for n in pieces])[:, None]
+    first = np.repeat(np.cumsum(pieces) - pieces, pieces)
+    share = ((np.arange(len(first)) - first) / np.repeat(pieces, pieces))[:, None]
     points = np.repeat(ends[:, 0], pieces, axis=0) * (1.0 - share) + np.repeat(ends[:, 1], pieces, axis=0) * share
     points = np.concatenate([points, inner[np.unique(edges)]])
     distances = np.empty(len(points))
