@@ -45,7 +45,7 @@ def euler_past(system: System, state: State, dt: float) -> Past:
     return Past(
         h=dt, origin=state.positions, inertial=state.positions + dt * state.velocities,
         rigid_origin=state.rigid_positions, rigid_inertial=state.rigid_positions + dt * state.rigid_velocities,
-        turns=_spins(system, inertias, state) * dt, inertias=inertias,
+        turns=_spins(system, inertias, state.angular_momenta) * dt, inertias=inertias,
     )
 
 
@@ -80,7 +80,7 @@ def bdf2_past(system: System, state: State, dt: float) -> Past:
         (state.velocities, before.velocities), (state.rigid_velocities, before.rigid_velocities),
         (state.angular_momenta, before.angular_momenta)))
     turns, inertias = np.zeros((system.n_rigid, 3)), np.zeros((system.n_rigid, 3, 3))
-    spins = dt * _spins(system, system.world_inertias(state.rigid_rotations), state)
+    spins = dt * _spins(system, system.world_inertias(state.rigid_rotations), state.angular_momenta)
     for r, (spin, now, then) in enumerate(zip(spins, state.rigid_rotations, before.rigid_rotations, strict=True)):
         left = np.linalg.inv(inverse_left_jacobian(spin))
         turned = rotation_matrix(spin) @ now
@@ -93,11 +93,11 @@ def bdf2_past(system: System, state: State, dt: float) -> Past:
     )
 
 
-def _spins(system: System, inertias: np.ndarray, state: State) -> np.ndarray:
+def _spins(system: System, inertias: np.ndarray, momenta: np.ndarray) -> np.ndarray:
     """Return the angular velocities [rad/s] of the rigid bodies, shape (n_rigid, 3)."""
     if not system.n_rigid:
         return np.zeros((0, 3))
-    return np.linalg.solve(inertias, state.angular_momenta[:, :, None])[:, :, 0]
+    return np.linalg.solve(inertias, momenta[:, :, None])[:, :, 0]
 
 
 class Increment:
@@ -122,27 +122,44 @@ class Increment:
         self.damping = system.damping.over(state, past) if system.damping is not None and soft_inertia else None
         #: loads that do not act yet [N], (n_vertices, 3); None: all do
         self.withheld = None if load_share == 1.0 else (1.0 - load_share) * system.forces
-        #: a typical energy [J], for the rounding of differences of energies
-        self.scale = abs(system.energy(state))
+        #: energy [J] without inertia where the gradient was taken last: what differences of energies are rounded to
+        self.scale = 0.0
 
     def predicted(self) -> State:
-        """Return where to start: driven vertices at their targets, the rest moving on, or staying if that is lower."""
-        candidates = [self._start(1.0), self._start(0.0)]
-        energies = [self.energy(candidate) for candidate in candidates]
-        return candidates[1] if energies[1] < energies[0] else candidates[0]
+        """Return the lowest of three starts: going on with the last acceleration, with the last velocity, or staying.
 
-    def _start(self, share: float) -> State:
+        Driven vertices are at their targets in all of them. The first is the nearest, by one order of the step, where
+        motion is smooth; after an impact the last acceleration means nothing.
+        """
+        start = self.start
+        moving = self._start(start.velocities, start.rigid_velocities, start.angular_momenta)
+        energy = self.energy(moving)
+        if start.previous is not None:
+            before, ratio = start.previous, self.dt / (start.time - start.previous.time)
+            bent = self._start(
+                start.velocities + ratio * (start.velocities - before.velocities),
+                start.rigid_velocities + ratio * (start.rigid_velocities - before.rigid_velocities),
+                start.angular_momenta + ratio * (start.angular_momenta - before.angular_momenta),
+            )
+            if self.energy(bent) < energy:
+                return bent
+        still = self._driven(start)
+        return still if self.energy(still) < energy else moving
+
+    def _start(self, velocities: np.ndarray, rigid_velocities: np.ndarray, momenta: np.ndarray) -> State:
+        """Return the start moved by these for the whole step, or as far as contact lets it go."""
         start, system = self.start, self.system
-        spins = _spins(system, system.world_inertias(start.rigid_rotations), start) * self.dt
+        spins = _spins(system, system.world_inertias(start.rigid_rotations), momenta)
         direction = Direction(
-            soft=self.dt * start.velocities, rigid=np.concatenate([self.dt * start.rigid_velocities, spins], axis=1)
+            soft=self.dt * velocities, rigid=self.dt * np.concatenate([rigid_velocities, spins], axis=1)
         )
-        if share > 0.0:
-            share = min(share, system.contact.step_limit(start, direction))
-        moved = start.moved(direction, share)
-        positions = np.where(system.fixed, start.positions, moved.positions)
-        system.prescribe(positions, self.progress, self.time)
-        return replace(moved, positions=positions)
+        return self._driven(start.moved(direction, min(1.0, system.contact.step_limit(start, direction))))
+
+    def _driven(self, state: State) -> State:
+        """Return ``state`` with held vertices where the step started and driven ones at their targets."""
+        positions = np.where(self.system.fixed, self.start.positions, state.positions)
+        self.system.prescribe(positions, self.progress, self.time)
+        return replace(state, positions=positions)
 
     def _turns(self, state: State) -> np.ndarray:
         turns = np.zeros((self.system.n_rigid, 3))
@@ -174,7 +191,9 @@ class Increment:
         system, d, past = self.system, self.system.derivatives, self.past
         d.clear_gradient()
         turns = self._turns(state)
-        energy = system.add_gradient(state) + self._inertia_energy(state, turns)
+        energy = system.add_gradient(state)
+        self.scale = abs(energy)
+        energy += self._inertia_energy(state, turns)
         d.soft += self.vertex_weight * (state.positions - past.inertial)
         if self.damping is not None:
             energy += self.damping.add_gradient(state.positions, d.soft)

@@ -19,7 +19,8 @@ LAG_SHARE = 0.1  # or this share of the largest normal force on a body
 LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
 LAG_CHANGE = 0.5  # share of the friction bounds, in sum, that may miss Coulomb's law at the end of a step
 PATIENCE = 4  # times as many renewals are granted before what they leave makes the step fail
-EARLY = 100.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
+EARLY = 1000.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
+INNER = 0.1  # share of what a renewal unbalanced that Newton leaves before the next one: it will unbalance more
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
 
@@ -72,21 +73,22 @@ class Newton:
         system, increment, report, options = self.system, self.increment, self.report, self.options
         energy = increment.gradient(trial)
         report.residual, report.where = system.residual()
-        early, best, best_jump = True, None, np.inf
+        early, best, best_jump, renewed = True, None, np.inf, 0.0
         while True:
             report.residuals.append(report.residual)
             if not (np.isfinite(report.residual) and np.isfinite(energy)):
                 report.reason = f"the forces are no longer finite ({report.where})"
                 break
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
-            least = options.tolerance_N if report.iterations else 1e-3 * options.tolerance_N
+            least = max(options.tolerance_N, INNER * renewed) if report.iterations else 1e-3 * options.tolerance_N
             done = report.residual <= least
             if done or (early and report.iterations and report.residual <= EARLY * options.tolerance_N):
                 early = False
-                change = system.contact.relag(trial)
+                change, before = system.contact.relag(trial), report.residual
                 report.friction_updates += 1
                 energy = increment.gradient(trial)
                 report.residual, report.where = system.residual()
+                renewed = max(report.residual - before, 0.0)
                 progress = report.residual < LAG_PROGRESS * best_jump
                 light = float(np.sum(system.contact.relagged_forces)) <= LAG_FORCE
                 if done and report.residual < best_jump and (light or change <= LAG_CHANGE):
@@ -108,8 +110,7 @@ class Newton:
                 if best is None and report.residual <= options.tolerance_N:  # at rest already, to the last digit
                     best, best_jump, report.reason = trial, report.residual, ""
                 break
-            trial = moved
-            energy = increment.gradient(trial)
+            trial, energy = moved
             report.residual, report.where = system.residual()
         if best is None:
             left = f"{report.residual:.3g} N left on {report.where}"
@@ -133,10 +134,12 @@ class Newton:
         """Return what renewed contact may leave unbalanced at the end of a step [N]."""
         return max(LAG_FORCE, LAG_SHARE * float(np.max(self.system.contact.relagged_forces, initial=0.0)))
 
-    def _iterate(self, trial: State, energy: float) -> State | None:
-        """Do one Newton iteration; None if no direction leads downhill."""
+    def _iterate(self, trial: State, energy: float) -> tuple[State, float] | None:
+        """Do one Newton iteration; return where it led, as `_search` does, or None if no direction leads downhill."""
         report = self.report
         for projected in (False, True):
+            if projected:  # the first search has left the gradient of another state
+                self.increment.gradient(trial)
             self.increment.hessian(trial, projected=projected)
             solution = self._solve()
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
@@ -159,15 +162,23 @@ class Newton:
         self.report.factorisations += int(solution.factorised)
         return solution
 
-    def _search(self, trial: State, energy: float, direction: Direction, slope: float) -> State | None:
-        """Backtrack until Armijo's condition holds, by the parabola through both energies and the slope."""
+    def _search(
+        self, trial: State, energy: float, direction: Direction, slope: float
+    ) -> tuple[State, float] | None:
+        """Backtrack until Armijo's condition holds, by the parabola through both energies and the slope.
+
+        Returns the state and its energy [J], with its gradient in the system's derivatives.
+        """
+        increment, first = self.increment, True
         share = self.system.contact.step_limit(trial, direction)
-        slack = ROUNDING * (abs(energy) + self.increment.scale)
+        slack = ROUNDING * (abs(energy) + increment.scale)
         while share > SHORTEST:
             moved = trial.moved(direction, share)
-            found = self.increment.energy(moved)
+            # most first steps are accepted, and then the gradient is due anyway
+            found = increment.gradient(moved) if first else increment.energy(moved)
             if found <= energy + ARMIJO * share * slope + slack:
-                return moved
+                return (moved, found) if first else (moved, increment.gradient(moved))
+            first = False
             self.report.line_searches += 1
             curvature = found - energy - share * slope
             best = -0.5 * slope * share * share / curvature if np.isfinite(curvature) and curvature > 0.0 else 0.0
