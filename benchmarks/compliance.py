@@ -102,7 +102,7 @@ def compliance(mesh: Mesh, contact_line: np.ndarray, material: Material = MATERI
     start = time.perf_counter()
     potential = registry.create("elasticity", "corotated").potential(mesh, material)
     pattern = BlockPattern.from_cliques(mesh.n_vertices, potential.cliques)
-    blocks = np.zeros((pattern.n_blocks, 3, 3))
+    blocks = pattern.new_blocks()
     potential.add_hessian(mesh.vertices, tuple(pattern.slots(nodes) for nodes in potential.cliques), blocks)
     free = np.setdiff1d(np.arange(mesh.n_vertices), mesh.node_sets["base"])
     dofs = (3 * free[:, None] + np.arange(3)).ravel()

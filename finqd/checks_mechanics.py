@@ -314,7 +314,7 @@ def _dense_hessian(potential: Any, positions: np.ndarray, *, projected: bool) ->
     from finqd.mechanics.pattern import BlockPattern
 
     pattern = BlockPattern.from_cliques(len(positions), potential.cliques)
-    blocks = np.zeros((pattern.n_blocks, 3, 3))
+    blocks = pattern.new_blocks()
     slots = tuple(pattern.slots(clique) for clique in potential.cliques)
     potential.add_hessian(positions, slots, blocks, projected=projected)
     return pattern.matrix(blocks).toarray()

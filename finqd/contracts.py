@@ -101,11 +101,11 @@ class ElasticPotential(Protocol):
     def add_hessian(
         self, positions: np.ndarray, slots: tuple[np.ndarray, ...], blocks: np.ndarray, *, projected: bool = False
     ) -> None:
-        """Add the Hessian [N/m] to ``blocks``, shape (n_blocks, 3, 3).
+        """Add the Hessian [N/m] to ``blocks``, shape (n_blocks + 1, 3, 3).
 
         ``slots[b][e, i, j]`` is the index into ``blocks`` of the pair (node i, node j) of element e of block b
-        (see `finqd.mechanics.pattern`). ``projected``: each element's matrix is made positive semidefinite; otherwise
-        it is the exact second derivative.
+        (see `finqd.mechanics.pattern`; pairs below the diagonal all lead to the last block, which is not read).
+        ``projected``: each element's matrix is made positive semidefinite; otherwise it is the exact second derivative.
         """
 
 

@@ -275,21 +275,25 @@ def test_pattern_holds_exactly_the_pairs_of_its_cliques() -> None:
         expected[np.ix_(nodes, nodes)] = True
     dense = pattern.matrix(np.ones((pattern.n_blocks, 3, 3))).toarray()[::3, ::3] > 0
     assert np.array_equal(dense, expected)
-    assert pattern.n_blocks == expected.sum()
+    assert pattern.n_blocks == np.triu(expected).sum()
+    assert np.array_equal(pattern.indices[pattern.indptr[:-1]], np.arange(8))
 
 
 def test_slots_scatter_to_rows_and_columns_of_their_vertices() -> None:
     pattern = BlockPattern.from_cliques(8, [CLIQUES])
-    slots = pattern.slots(CLIQUES)
-    blocks, expected = np.zeros((pattern.n_blocks, 3, 3)), np.zeros((24, 24))
+    slots = pattern.slots(CLIQUES[:, ::-1])
+    blocks, expected = pattern.new_blocks(), np.zeros((24, 24))
     rng = np.random.default_rng(6)
-    for e, clique in enumerate(CLIQUES):
+    for e, clique in enumerate(CLIQUES[:, ::-1]):  # falling vertex numbers: both triangles must find their places
+        element = rng.normal(size=(12, 12))
+        element += element.T
         for i, a in enumerate(clique):
             for j, b in enumerate(clique):
                 if a < 0 or b < 0:
                     assert slots[e, i, j] == -1
                     continue
-                block = rng.normal(size=(3, 3))
+                block = element[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
+                assert (slots[e, i, j] == pattern.n_blocks) == (b < a)
                 blocks[slots[e, i, j]] += block
                 expected[3 * a : 3 * a + 3, 3 * b : 3 * b + 3] += block
     assert np.allclose(pattern.matrix(blocks).toarray(), expected, atol=1e-15)
@@ -300,7 +304,7 @@ def test_slots_scatter_to_rows_and_columns_of_their_vertices() -> None:
 def test_held_unknowns_become_rows_of_the_identity() -> None:
     pattern = BlockPattern.from_cliques(8, [CLIQUES])
     rng = np.random.default_rng(7)
-    blocks, coupling = rng.normal(size=(pattern.n_blocks, 3, 3)), rng.normal(size=(24, 6))
+    blocks, coupling = rng.normal(size=(pattern.n_blocks + 1, 3, 3)), rng.normal(size=(24, 6))
     fixed = np.zeros((8, 3), dtype=bool)
     fixed[2], fixed[5, 1], fixed[7, 0] = True, True, True
     expected, expected_coupling = pattern.matrix(blocks.copy()).toarray(), coupling.copy()
@@ -315,8 +319,8 @@ def test_held_unknowns_become_rows_of_the_identity() -> None:
 
 def test_diagonal_and_largest_force() -> None:
     pattern = BlockPattern.from_cliques(8, [CLIQUES])
-    blocks = np.zeros((pattern.n_blocks, 3, 3))
-    add_diagonal(pattern.indptr, pattern.indices, np.arange(8.0), blocks)
+    blocks = pattern.new_blocks()
+    add_diagonal(pattern.indptr, np.arange(8.0), blocks)
     assert np.array_equal(pattern.matrix(blocks).toarray(), np.diag(np.repeat(np.arange(8.0), 3)))
     forces, fixed = np.zeros((4, 3)), np.zeros((4, 3), dtype=bool)
     forces[1], forces[2] = (3.0, 4.0, 0.0), (100.0, 0.0, 1.0)

@@ -31,7 +31,7 @@ def small_mesh(name: str) -> Mesh:
 
 def dense_hessian(potential, positions: np.ndarray, *, projected: bool = False) -> np.ndarray:
     pattern = BlockPattern.from_cliques(len(positions), potential.cliques)
-    blocks = np.zeros((pattern.n_blocks, 3, 3))
+    blocks = pattern.new_blocks()
     slots = tuple(pattern.slots(nodes) for nodes in potential.cliques)
     potential.add_hessian(positions, slots, blocks, projected=projected)
     return pattern.matrix(blocks).toarray()
@@ -266,7 +266,7 @@ def test_materials_outside_the_theory_are_refused():
 def stiffness_at_rest(mesh: Mesh, material: Material):
     potential = Corotated().potential(mesh, material)
     pattern = BlockPattern.from_cliques(mesh.n_vertices, potential.cliques)
-    blocks = np.zeros((pattern.n_blocks, 3, 3))
+    blocks = pattern.new_blocks()
     potential.add_hessian(mesh.vertices, tuple(pattern.slots(nodes) for nodes in potential.cliques), blocks)
     return pattern.matrix(blocks).tocsc()
 

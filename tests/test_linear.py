@@ -33,14 +33,14 @@ class System:
         elements = elements[[len(set(e)) == 4 for e in elements.tolist()]]
         self.pattern = BlockPattern.from_cliques(n, [elements])
         slots = self.pattern.slots(elements)
-        self.blocks = np.zeros((self.pattern.n_blocks, 3, 3))
+        self.blocks = self.pattern.new_blocks()
         self.coupling, self.rigid = np.zeros((3 * n, m)), 0.3 * np.eye(m)
         for slot in slots:
             factor = rng.normal(size=(12, 10))
             add = (factor @ factor.T).reshape(4, 3, 4, 3).transpose(0, 2, 1, 3)
             np.add.at(self.blocks, slot.reshape(-1), add.reshape(-1, 3, 3))
-        rows = np.repeat(np.arange(n), np.diff(self.pattern.indptr))
-        self.blocks[rows == self.pattern.indices] += (0.1 - shift) * np.eye(3)
+        diagonal = self.pattern.indptr[:-1]
+        self.blocks[diagonal] += (0.1 - shift) * np.eye(3)
         for vertex in range(10, 16):  # contacts: k g g^T with g over one vertex and one body
             if m:
                 g = np.zeros(3 * n + m)
@@ -48,9 +48,10 @@ class System:
                 body = 3 * n + 6 * (vertex % bodies)
                 g[body : body + 6] = rng.normal(size=6)
                 self.add(10.0 * np.outer(g, g), vertex)
+        rows = np.repeat(np.arange(n), np.diff(diagonal, append=self.pattern.n_blocks))
         held = np.isin(rows, (0, 1)) | np.isin(self.pattern.indices, (0, 1))
-        self.blocks[held] = 0.0
-        self.blocks[held & (rows == self.pattern.indices)] = np.eye(3)
+        self.blocks[:-1][held] = 0.0
+        self.blocks[diagonal[:2]] = np.eye(3)
         self.coupling[:6] = 0.0
         self.rhs_soft, self.rhs_rigid = rng.normal(size=(n, 3)), rng.normal(size=m)
 
@@ -122,12 +123,11 @@ def test_an_indefinite_system_is_reported(options, where):
 def test_the_inertia_agrees_with_the_eigenvalues(backend):
     """From clearly positive to clearly negative, with one eigenvalue crossing zero at a time."""
     system = System(5, bodies=0)
-    rows = np.repeat(np.arange(system.pattern.n_vertices), np.diff(system.pattern.indptr))
     values = np.linalg.eigvalsh(system.dense)
     factorisation = create_factorisation(backend, system.pattern)
     for shift in (0.0, 0.5 * values[0], 0.5 * (values[0] + values[1]), 0.5 * (values[3] + values[4])):
         blocks = system.blocks.copy()
-        blocks[rows == system.pattern.indices] -= shift * np.eye(3)
+        blocks[system.pattern.indptr[:-1]] -= shift * np.eye(3)
         try:
             positive = factorisation.factorise(blocks)
         except np.linalg.LinAlgError:

@@ -51,7 +51,7 @@ def equilibrium(potential, start: np.ndarray, forces, free: np.ndarray, *, toler
         if np.abs(residual).max() < tolerance * max(scale, np.abs(forces).max()):
             return x
         for projected in (False, True):
-            blocks = np.zeros((pattern.n_blocks, 3, 3))
+            blocks = pattern.new_blocks()
             potential.add_hessian(x, slots, blocks, projected=projected)
             matrix = pattern.matrix(blocks).tocsc()[rows][:, rows]
             step = np.zeros(x.size)
@@ -259,7 +259,7 @@ def cook(name: str, n: int, poisson: float, potential_of) -> float:
     mesh = Mesh(vertices, box.blocks, box.node_sets, box.face_sets)
     potential = potential_of(mesh, Material(youngs_modulus=70e6, poisson_ratio=poisson, density=1.0))
     pattern = BlockPattern.from_cliques(mesh.n_vertices, potential.cliques)
-    blocks = np.zeros((pattern.n_blocks, 3, 3))
+    blocks = pattern.new_blocks()
     potential.add_hessian(vertices, tuple(pattern.slots(nodes) for nodes in potential.cliques), blocks)
     free = np.ones(vertices.shape, dtype=bool)
     free[:, 2] = (z > 1e-9) & (z < 1 - 1e-9)

@@ -21,7 +21,7 @@ class Scripted(Newton):
 
     def _iterate(self, trial: Any, energy: float) -> Any:
         self.system.left = 0.0
-        return trial
+        return trial, energy
 
 
 def run(left: Sequence[float], changes: Sequence[float], *, force: float = HEAVY) -> StepReport:

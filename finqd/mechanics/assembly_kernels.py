@@ -5,13 +5,11 @@ from numba import njit
 
 
 @njit(cache=True)
-def add_diagonal(indptr, indices, values, blocks):
-    """Add ``values`` (n_vertices,) times the 3 x 3 identity to the diagonal blocks."""
+def add_diagonal(indptr, values, blocks):
+    """Add ``values`` (n_vertices,) times the 3 x 3 identity to the diagonal blocks, each the first of its row."""
     for i in range(values.shape[0]):
-        for s in range(indptr[i], indptr[i + 1]):
-            if indices[s] == i:
-                for a in range(3):
-                    blocks[s, a, a] += values[i]
+        for a in range(3):
+            blocks[indptr[i], a, a] += values[i]
 
 
 @njit(cache=True)

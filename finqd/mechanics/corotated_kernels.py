@@ -345,7 +345,7 @@ def _spin_rows(y, kc, q_columns, omega, columns, w, ywy, b):
 
 @njit(cache=True)
 def _scatter(e, stiffness, omega, b, r, rows, turned, slots, blocks):
-    """Add R (K + b^T Omega + Omega^T b) R^T [N/m] of element e to blocks (n_blocks, 3, 3), row of nodes by row."""
+    """Add R (K + b^T Omega + Omega^T b) R^T [N/m] of element e to blocks (n_blocks + 1, 3, 3), row of nodes by row."""
     m = omega.shape[1]
     k = m // 3
     r00, r01, r02, r10, r11, r12 = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2]
@@ -378,7 +378,7 @@ def _scatter(e, stiffness, omega, b, r, rows, turned, slots, blocks):
 
 @njit(cache=True)
 def add_hessian(nodes, rest, gradients, stiffness, compliance, positions, slots, blocks, projected):
-    """Add the Hessian [N/m] of a block of elements to blocks (n_blocks, 3, 3); slots (n, k, k).
+    """Add the Hessian [N/m] of a block of elements to blocks (n_blocks + 1, 3, 3); slots (n, k, k).
 
     projected: add each element's smallest spin stiffness that makes its matrix positive semidefinite (`_clamp_spin`);
     compliance, K^+ [m/N], is read only then. A folded element (`_inverse_spin`) then counts with R K R^T alone.

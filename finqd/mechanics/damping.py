@@ -125,7 +125,7 @@ class Damping:
         return np.exp(-time * self._rates)[:, None]
 
     def add_viscosity(self, positions: np.ndarray, blocks: np.ndarray) -> None:
-        """Add to ``blocks`` (n_blocks, 3, 3) the matrix D [N s/m] of the viscous forces -D v at ``positions``.
+        """Add to ``blocks`` (n_blocks + 1, 3, 3) the matrix D [N s/m] of the viscous forces -D v at ``positions``.
 
         D = (dy/dx)^T beta K dy/dx: positive semidefinite, zero for rigid motions. The exact Hessian of corotated
         elements that are at rest in their present shape is just that.
@@ -176,11 +176,11 @@ class StepDamping:
         return energy
 
     def add_hessian(self, positions: np.ndarray, blocks: np.ndarray, *, projected: bool = False) -> None:
-        """Add its Hessian [N/m] to ``blocks`` (n_blocks, 3, 3); ``projected``: the positive semidefinite part of it
+        """Add its Hessian [N/m] to ``blocks`` (n_blocks + 1, 3, 3); ``projected``: the positive semidefinite part of it
         that `Damping.add_viscosity` describes.
         """
         damping = self.damping
-        add_diagonal(damping.pattern.indptr, damping.pattern.indices, self.weight[:, 0], blocks)
+        add_diagonal(damping.pattern.indptr, self.weight[:, 0], blocks)
         for b, (block, stiffness) in enumerate(zip(damping.viscous, self.stiffnesses, strict=True)):
             shapes = block.shapes(positions) if projected else self.shapes[b]
             kernels.add_hessian(

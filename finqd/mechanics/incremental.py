@@ -122,8 +122,8 @@ class Increment:
         self.damping = system.damping.over(state, past) if system.damping is not None and soft_inertia else None
         #: loads that do not act yet [N], (n_vertices, 3); None: all do
         self.withheld = None if load_share == 1.0 else (1.0 - load_share) * system.forces
-        #: energy [J] without inertia where the gradient was taken last: what differences of energies are rounded to
-        self.scale = 0.0
+        #: a typical energy [J], for the rounding of differences of energies
+        self.scale = abs(system.energy(state))
 
     def predicted(self) -> State:
         """Return the lowest of three starts: going on with the last acceleration, with the last velocity, or staying.
@@ -191,9 +191,7 @@ class Increment:
         system, d, past = self.system, self.system.derivatives, self.past
         d.clear_gradient()
         turns = self._turns(state)
-        energy = system.add_gradient(state)
-        self.scale = abs(energy)
-        energy += self._inertia_energy(state, turns)
+        energy = system.add_gradient(state) + self._inertia_energy(state, turns)
         d.soft += self.vertex_weight * (state.positions - past.inertial)
         if self.damping is not None:
             energy += self.damping.add_gradient(state.positions, d.soft)
@@ -210,7 +208,7 @@ class Increment:
         system, d, h = self.system, self.system.derivatives, self.past.h
         d.clear_hessian()
         system.add_hessian(state, projected=projected)
-        add_diagonal(system.pattern.indptr, system.pattern.indices, self.masses / h**2, d.blocks)
+        add_diagonal(system.pattern.indptr, self.masses / h**2, d.blocks)
         if self.damping is not None:
             self.damping.add_hessian(state.positions, d.blocks, projected=projected)
         for b, turn in enumerate(self._turns(state)):

@@ -65,7 +65,7 @@ class LinearSolution:
 
 @dataclass(frozen=True)
 class CoupledMatrix:
-    """[[A, B], [B^T, C]]: ``blocks`` (n_blocks, 3, 3), ``coupling`` B (3 n, m), ``rigid`` C (m, m)."""
+    """[[A, B], [B^T, C]]: ``blocks`` of A's upper triangle, ``coupling`` B (3 n, m), ``rigid`` C (m, m)."""
 
     pattern: BlockPattern
     blocks: np.ndarray
@@ -85,11 +85,9 @@ class CoupledMatrix:
 
     def diagonal_blocks(self) -> tuple[np.ndarray, list[np.ndarray]]:
         """Return the 3 x 3 diagonal blocks of A (n, 3, 3) and the 6 x 6 ones of C, one a rigid body."""
-        pattern = self.pattern
-        rows = np.repeat(np.arange(pattern.n_vertices), np.diff(pattern.indptr))
         m = len(self.rigid)
         bodies = [self.rigid[i : min(i + 6, m), i : min(i + 6, m)] for i in range(0, m, 6)]
-        return self.blocks[rows == pattern.indices], bodies
+        return self.blocks[self.pattern.indptr[:-1]], bodies
 
 
 class Preconditioner(Protocol):
@@ -112,7 +110,7 @@ class CoupledInverse:
         """Factorise ``matrix``; raises ``numpy.linalg.LinAlgError`` if it is singular."""
         self._factorisation = factorisation
         # a scene without soft bodies has nothing to factorise
-        self.positive = factorisation.factorise(matrix.blocks) if len(matrix.blocks) else True
+        self.positive = factorisation.factorise(matrix.blocks) if len(matrix.coupling) else True
         self._size = len(matrix.coupling)
         self._eliminated = np.zeros(matrix.coupling.shape)
         self._schur_inverse = np.zeros((0, 0))
@@ -279,8 +277,9 @@ class LinearSolver:
     ) -> LinearSolution:
         """Solve [[A, B], [B^T, C]] [x; y] = [r; s].
 
-        blocks: A (n_blocks, 3, 3); coupling: B (3 n, m); rigid: C (m, m); rhs_soft: r, 3 n numbers of any shape;
-        rhs_rigid: s, m numbers of any shape; tolerance: see `conjugate_gradients`, the solver's own if None
+        blocks: A (n_blocks + 1, 3, 3), see `BlockPattern`; coupling: B (3 n, m); rigid: C (m, m)
+        rhs_soft: r, 3 n numbers of any shape; rhs_rigid: s, m numbers of any shape
+        tolerance: see `conjugate_gradients`, the solver's own if None
         """
         m = rhs_rigid.size
         matrix = CoupledMatrix(

@@ -44,7 +44,7 @@ class Factorisation(Protocol):
     factor_entries: int
 
     def factorise(self, blocks: np.ndarray) -> bool:
-        """Factorise the matrix with these ``blocks`` (n_blocks, 3, 3); return whether it is positive definite.
+        """Factorise the matrix with these ``blocks`` (of `BlockPattern`); return whether it is positive definite.
 
         Raises ``numpy.linalg.LinAlgError`` if it is singular, or indefinite and the library stops there.
         """
@@ -104,14 +104,20 @@ class Rows:
         rows = 3 * row_of_block[:, None, None] + np.arange(3)[None, :, None]
         columns = 3 * pattern.indices[:, None, None] + np.arange(3)[None, None, :]
         rows, columns = (np.broadcast_to(a, (pattern.n_blocks, 3, 3)).reshape(-1) for a in (rows, columns))
-        keep = {"lower": columns <= rows, "upper": columns >= rows, "full": np.ones(len(rows), bool)}[part]
-        source = np.flatnonzero(keep)
-        source = source[np.lexsort((columns[source], rows[source]))]
+        source = np.flatnonzero(columns >= rows)
+        rows, columns = rows[source], columns[source]
+        if part == "lower":
+            rows, columns = columns, rows
+        elif part == "full":
+            off = columns > rows
+            rows, columns = np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]])
+            source = np.concatenate([source, source[off]])
+        order = np.lexsort((columns, rows))
         self.size = 3 * pattern.n_vertices
-        self.indptr = np.concatenate([[0], np.cumsum(np.bincount(rows[source], minlength=self.size))]).astype(np.int32)
-        self.indices = columns[source].astype(np.int32)
+        self.indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=self.size))]).astype(np.int32)
+        self.indices = columns[order].astype(np.int32)
         self.values = np.empty(len(source))
-        self._source = source.astype(np.uint32)
+        self._source = source[order].astype(np.uint32)
 
     def fill(self, blocks: np.ndarray) -> np.ndarray:
         """Copy ``blocks`` into ``values``, in the order of ``indices``, and return it."""

@@ -12,7 +12,7 @@ from numba import njit
 def coupled_product(indptr, indices, blocks, coupling, rigid, x, product):
     r"""Write ``[[A, B], [B^T, C]] x`` to ``product``.
 
-    indptr (n + 1,), indices (n_blocks,), blocks (n_blocks, 3, 3): A in block compressed rows
+    indptr (n + 1,), indices (n_blocks,), blocks: A, the upper triangle in block compressed rows, diagonal block first
     coupling: B, shape (3 n, m); rigid: C, shape (m, m); x, product: shape (3 n + m,)
     Units: those of the caller, [N/m] times [m] for a Newton system.
     """
@@ -24,21 +24,27 @@ def coupled_product(indptr, indices, blocks, coupling, rigid, x, product):
         for j in range(m):
             total += rigid[i, j] * x[size + j]
         product[size + i] = total
+    for i in range(size):
+        product[i] = 0.0
     for row in range(n):
-        a0 = 0.0
-        a1 = 0.0
-        a2 = 0.0
+        a0, a1, a2 = 0.0, 0.0, 0.0
+        r0, r1, r2 = x[3 * row], x[3 * row + 1], x[3 * row + 2]
         for slot in range(indptr[row], indptr[row + 1]):
             column = 3 * indices[slot]
-            x0 = x[column]
-            x1 = x[column + 1]
-            x2 = x[column + 2]
-            a0 += blocks[slot, 0, 0] * x0 + blocks[slot, 0, 1] * x1 + blocks[slot, 0, 2] * x2
-            a1 += blocks[slot, 1, 0] * x0 + blocks[slot, 1, 1] * x1 + blocks[slot, 1, 2] * x2
-            a2 += blocks[slot, 2, 0] * x0 + blocks[slot, 2, 1] * x1 + blocks[slot, 2, 2] * x2
-        product[3 * row] = a0
-        product[3 * row + 1] = a1
-        product[3 * row + 2] = a2
+            x0, x1, x2 = x[column], x[column + 1], x[column + 2]
+            b00, b01, b02 = blocks[slot, 0, 0], blocks[slot, 0, 1], blocks[slot, 0, 2]
+            b10, b11, b12 = blocks[slot, 1, 0], blocks[slot, 1, 1], blocks[slot, 1, 2]
+            b20, b21, b22 = blocks[slot, 2, 0], blocks[slot, 2, 1], blocks[slot, 2, 2]
+            a0 += b00 * x0 + b01 * x1 + b02 * x2
+            a1 += b10 * x0 + b11 * x1 + b12 * x2
+            a2 += b20 * x0 + b21 * x1 + b22 * x2
+            if slot > indptr[row]:
+                product[column] += b00 * r0 + b10 * r1 + b20 * r2
+                product[column + 1] += b01 * r0 + b11 * r1 + b21 * r2
+                product[column + 2] += b02 * r0 + b12 * r1 + b22 * r2
+        product[3 * row] += a0
+        product[3 * row + 1] += a1
+        product[3 * row + 2] += a2
     if m > 0:
         for i in range(size):
             total = 0.0

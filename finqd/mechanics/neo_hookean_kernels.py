@@ -364,7 +364,7 @@ def add_gradient(nodes, shapes, weights, group, start, hourglass, mu, kappa, pos
 @njit(cache=True)
 def add_hessian(nodes, shapes, weights, group, start, hourglass, mu, kappa, positions, modes, known, slots, blocks,
                 projected):
-    """Add the Hessian [N/m] of a block to blocks (n_blocks, 3, 3); slots (n, k, k). Inverted elements add nothing.
+    """Add the Hessian [N/m] of a block to blocks (n_blocks + 1, 3, 3); slots (n, k, k). Inverted elements add nothing.
 
     modes, known: as in `add_gradient`; projected: negative eigenvalues of each element's condensed matrix become zero
     """

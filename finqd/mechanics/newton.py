@@ -21,8 +21,11 @@ LAG_CHANGE = 0.5  # share of the friction bounds, in sum, that may miss Coulomb'
 PATIENCE = 4  # times as many renewals are granted before what they leave makes the step fail
 EARLY = 1000.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
 INNER = 0.1  # share of what a renewal unbalanced that Newton leaves before the next one: it will unbalance more
+FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
+BLURRED = 1e-9  # relative rise of an energy that may be rounding, if the slope along the step falls to
+FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and Zhang, SIAM J. Optim. 16 (2005) 170)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +62,20 @@ class NewtonOptions:
         return system.solvers[key]
 
 
+@dataclass
+class _Renewals:
+    """What the renewals of contact in one step have left.
+
+    early: whether one is due before the minimum; added: what the last one unbalanced [N]
+    best: minimum that a renewal disturbed least, best_jump: by how much [N]
+    """
+
+    early: bool = True
+    added: float = 0.0
+    best: State | None = None
+    best_jump: float = np.inf
+
+
 @dataclass(frozen=True, kw_only=True)
 class Newton:
     """The minimisation of one ``increment``; ``report`` says how it went."""
@@ -70,34 +87,20 @@ class Newton:
 
     def minimise(self, trial: State) -> State:
         """Return the minimum that is found from ``trial``; it is one only if ``report.converged``."""
-        system, increment, report, options = self.system, self.increment, self.report, self.options
-        energy = increment.gradient(trial)
-        report.residual, report.where = system.residual()
-        early, best, best_jump, renewed = True, None, np.inf, 0.0
+        report, options, renewals = self.report, self.options, _Renewals()
+        energy = self.increment.gradient(trial)
+        report.residual, report.where = self.system.residual()
         while True:
             report.residuals.append(report.residual)
             if not (np.isfinite(report.residual) and np.isfinite(energy)):
                 report.reason = f"the forces are no longer finite ({report.where})"
                 break
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
-            least = max(options.tolerance_N, INNER * renewed) if report.iterations else 1e-3 * options.tolerance_N
-            done = report.residual <= least
-            if done or (early and report.iterations and report.residual <= EARLY * options.tolerance_N):
-                early = False
-                change, before = system.contact.relag(trial), report.residual
-                report.friction_updates += 1
-                energy = increment.gradient(trial)
-                report.residual, report.where = system.residual()
-                renewed = max(report.residual - before, 0.0)
-                progress = report.residual < LAG_PROGRESS * best_jump
-                light = float(np.sum(system.contact.relagged_forces)) <= LAG_FORCE
-                if done and report.residual < best_jump and (light or change <= LAG_CHANGE):
-                    best, best_jump = trial, report.residual
-                steady = change <= options.friction_tolerance and report.residual <= LAG_FORCE
-                still = report.residual <= options.tolerance_N or steady
-                tired = not progress or report.friction_updates > options.max_friction_updates
-                lasting = report.friction_updates > PATIENCE * options.max_friction_updates
-                if done and (still or (tired and (lasting or best_jump <= self._bound()))):
+            least = max(options.tolerance_N, INNER * renewals.added)
+            done = report.residual <= (least if report.iterations else FIRST * options.tolerance_N)
+            if done or (renewals.early and report.iterations and report.residual <= EARLY * options.tolerance_N):
+                energy, ended = self._renew(trial, renewals, done=done)
+                if ended:
                     break
                 continue
             if report.iterations >= options.max_iterations * (1 + report.friction_updates):
@@ -107,16 +110,35 @@ class Newton:
             report.iterations += 1
             moved = self._iterate(trial, energy)
             if moved is None:
-                if best is None and report.residual <= options.tolerance_N:  # at rest already, to the last digit
-                    best, best_jump, report.reason = trial, report.residual, ""
+                if renewals.best is None and report.residual <= options.tolerance_N:  # at rest, to the last digit
+                    renewals.best, renewals.best_jump, report.reason = trial, report.residual, ""
                 break
             trial, energy = moved
-            report.residual, report.where = system.residual()
-        if best is None:
+            report.residual, report.where = self.system.residual()
+        if renewals.best is None:
             left = f"{report.residual:.3g} N left on {report.where}"
             report.reason = report.reason or f"friction did not come to rest: {left}"
             return trial
-        return self._accept(best, best_jump)
+        return self._accept(renewals.best, renewals.best_jump)
+
+    def _renew(self, trial: State, renewals: _Renewals, *, done: bool) -> tuple[float, bool]:
+        """Renew what contact lags at ``trial``, a minimum if ``done``; return its energy, and whether the step ends."""
+        report, options, contact = self.report, self.options, self.system.contact
+        renewals.early = False
+        change, before = contact.relag(trial), report.residual
+        report.friction_updates += 1
+        energy = self.increment.gradient(trial)
+        report.residual, report.where = self.system.residual()
+        renewals.added = max(report.residual - before, 0.0)
+        progress = report.residual < LAG_PROGRESS * renewals.best_jump
+        light = float(np.sum(contact.relagged_forces)) <= LAG_FORCE
+        if done and report.residual < renewals.best_jump and (light or change <= LAG_CHANGE):
+            renewals.best, renewals.best_jump = trial, report.residual
+        steady = change <= options.friction_tolerance and report.residual <= LAG_FORCE
+        still = report.residual <= options.tolerance_N or steady
+        tired = not progress or report.friction_updates > options.max_friction_updates
+        lasting = report.friction_updates > PATIENCE * options.max_friction_updates
+        return energy, done and (still or (tired and (lasting or renewals.best_jump <= self._bound())))
 
     def _accept(self, best: State, jump: float) -> State:
         """End the step with the state that renewed friction disturbed least, by ``jump`` [N], if that is little.
@@ -143,8 +165,7 @@ class Newton:
             self.increment.hessian(trial, projected=projected)
             solution = self._solve()
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
-            d = self.system.derivatives
-            slope = float(np.vdot(d.soft, direction.soft) + np.vdot(d.rigid, direction.rigid))
+            slope = self._slope(direction)
             if solution.definite and slope < 0.0:
                 moved = self._search(trial, energy, direction, slope)
                 if moved is not None:
@@ -162,6 +183,11 @@ class Newton:
         self.report.factorisations += int(solution.factorised)
         return solution
 
+    def _slope(self, direction: Direction) -> float:
+        """Return the derivative of the energy along ``direction`` [J] where the gradient was taken last."""
+        d = self.system.derivatives
+        return float(np.vdot(d.soft, direction.soft) + np.vdot(d.rigid, direction.rigid))
+
     def _search(
         self, trial: State, energy: float, direction: Direction, slope: float
     ) -> tuple[State, float] | None:
@@ -171,13 +197,15 @@ class Newton:
         """
         increment, first = self.increment, True
         share = self.system.contact.step_limit(trial, direction)
-        slack = ROUNDING * (abs(energy) + increment.scale)
+        size = abs(energy) + increment.scale
         while share > SHORTEST:
             moved = trial.moved(direction, share)
             # most first steps are accepted, and then the gradient is due anyway
             found = increment.gradient(moved) if first else increment.energy(moved)
-            if found <= energy + ARMIJO * share * slope + slack:
+            if found <= energy + ARMIJO * share * slope + ROUNDING * size:
                 return (moved, found) if first else (moved, increment.gradient(moved))
+            if first and found <= energy + BLURRED * size and abs(self._slope(direction)) <= FLATTER * -slope:
+                return moved, found
             first = False
             self.report.line_searches += 1
             curvature = found - energy - share * slope

@@ -23,7 +23,8 @@ class Derivatives:
     """Gradient and Hessian of all potentials; buffers that are filled anew at each evaluation.
 
     soft: dE/dpositions [N], (n_vertices, 3); rigid: force [N] and torque [N m], (n_rigid, 6)
-    blocks: soft Hessian, (n_blocks, 3, 3); coupling: (3 n_vertices, 6 n_rigid); rigid_matrix: (6 n_rigid, 6 n_rigid)
+    blocks: soft Hessian, (n_blocks + 1, 3, 3), see `BlockPattern`
+    coupling: (3 n_vertices, 6 n_rigid); rigid_matrix: (6 n_rigid, 6 n_rigid)
     """
 
     soft: np.ndarray
@@ -82,7 +83,7 @@ class System:
         if self.damping is not None:
             self.damping.bind(self.pattern)
         self.derivatives = Derivatives(
-            soft=np.zeros((n, 3)), rigid=np.zeros((m, 6)), blocks=np.zeros((self.pattern.n_blocks, 3, 3)),
+            soft=np.zeros((n, 3)), rigid=np.zeros((m, 6)), blocks=self.pattern.new_blocks(),
             coupling=np.zeros((3 * n, 6 * m)), rigid_matrix=np.zeros((6 * m, 6 * m)),
         )
         self.shortest_step = 0.0

@@ -84,7 +84,7 @@ class CorotatedPotential:
     def add_hessian(
         self, positions: np.ndarray, slots: tuple[np.ndarray, ...], blocks: np.ndarray, *, projected: bool = False
     ) -> None:
-        """Add the Hessian [N/m] to ``blocks`` (n_blocks, 3, 3).
+        """Add the Hessian [N/m] to ``blocks`` (n_blocks + 1, 3, 3).
 
         ``projected``: exact where an element's Hessian is positive semidefinite, else changed by what makes it so,
         which is of the order of the stress (``_clamp_spin`` in the kernels).

@@ -48,7 +48,7 @@ class Linear:
         cliques = tuple(np.asarray(nodes, dtype=np.int64) for nodes in mesh.blocks.values() if len(nodes))
         names = [name for name, nodes in mesh.blocks.items() if len(nodes)]
         pattern = BlockPattern.from_cliques(len(vertices), cliques)
-        blocks = np.zeros((pattern.n_blocks, 3, 3))
+        blocks = pattern.new_blocks()
         for name, nodes in zip(names, cliques, strict=True):
             stiffness = rest_elements(name, vertices[nodes], material.lame).stiffness
             n, k = nodes.shape
@@ -75,7 +75,7 @@ def _base(mesh: Mesh, vertices: np.ndarray) -> np.ndarray:
 class LinearPotential:
     """Elastic energy of one soft body; satisfies `finqd.contracts.ElasticPotential`.
 
-    rest: X [m], (n, 3); base: vertex ids; stiffness: K [N/m], (n_blocks, 3, 3) of ``pattern``; matrix: the same, sparse
+    rest: X [m], (n, 3); base: vertex ids; stiffness: blocks of K [N/m] in ``pattern``; matrix: the same, sparse
     """
 
     rest: np.ndarray
@@ -119,7 +119,7 @@ class LinearPotential:
     def add_hessian(
         self, positions: np.ndarray, slots: tuple[np.ndarray, ...], blocks: np.ndarray, *, projected: bool = False
     ) -> None:
-        """Add the Hessian R K R^T [N/m] to ``blocks`` (n_blocks, 3, 3); it is positive semidefinite in any case."""
+        """Add the Hessian R K R^T [N/m] to ``blocks`` (n_blocks + 1, 3, 3); it is positive semidefinite in any case."""
         where, stiffness = self._places(slots)
         if len(self.base):
             rotation, _, _ = self.frame(positions)
@@ -130,7 +130,7 @@ class LinearPotential:
         """Return K's blocks (m, 3, 3) and which of the scene's blocks each goes to; looked up once for ``slots``."""
         known = self.places.get("slots")
         if known is None or len(known) != len(slots) or any(a is not b for a, b in zip(known, slots)):
-            where = np.full(self.pattern.n_blocks, -1)
+            where = np.full(len(self.stiffness), -1)
             for nodes, scene in zip(self.cliques, slots, strict=True):
                 where[self.pattern.slots(nodes - self.first_vertex).ravel()] = scene.ravel()
             used = where >= 0  # a vertex without elements has a block in the pattern, but no stiffness

@@ -121,7 +121,7 @@ class NeoHookeanPotential:
     def add_hessian(
         self, positions: np.ndarray, slots: tuple[np.ndarray, ...], blocks: np.ndarray, *, projected: bool = False
     ) -> None:
-        """Add the Hessian [N/m] to ``blocks`` (n_blocks, 3, 3).
+        """Add the Hessian [N/m] to ``blocks`` (n_blocks + 1, 3, 3).
 
         ``projected``: negative eigenvalues of each element's matrix, its modes condensed, are set to zero.
         """

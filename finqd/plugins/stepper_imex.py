@@ -102,5 +102,5 @@ class LinearlyImplicit:
         self.blocks, self.h = h * h * self.stiffness, h
         if self.viscosity is not None:
             self.blocks += h * self.viscosity
-        add_diagonal(system.pattern.indptr, system.pattern.indices, system.masses, self.blocks)
+        add_diagonal(system.pattern.indptr, system.masses, self.blocks)
         hold(system.pattern.indptr, system.pattern.indices, system.fixed, self.blocks, np.zeros((0, 0)))

@@ -43,9 +43,9 @@ def potential_of(mesh: Mesh, material: Material, elasticity: Any) -> Any:
 
 
 def stiffness(mesh: Mesh, potential: Any, positions: np.ndarray) -> tuple[BlockPattern, np.ndarray]:
-    """Return the Hessian at ``positions`` [N/m]: its pattern and its blocks (n_blocks, 3, 3)."""
+    """Return the Hessian at ``positions`` [N/m]: its pattern and its blocks (n_blocks + 1, 3, 3)."""
     pattern = BlockPattern.from_cliques(mesh.n_vertices, potential.cliques)
-    blocks = np.zeros((pattern.n_blocks, 3, 3))
+    blocks = pattern.new_blocks()
     potential.add_hessian(positions, tuple(pattern.slots(nodes) for nodes in potential.cliques), blocks)
     return pattern, blocks
 
