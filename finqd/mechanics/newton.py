@@ -19,7 +19,7 @@ LAG_SHARE = 0.1  # or this share of the largest normal force on a body
 LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
 LAG_CHANGE = 0.5  # share of the friction bounds, in sum, that may miss Coulomb's law at the end of a step
 PATIENCE = 4  # times as many renewals are granted before what they leave makes the step fail
-EARLY = 1000.0  # friction bounds are renewed as soon as the residual is within this multiple of the tolerance
+EARLY = 0.05  # [N] residual at which friction bounds are renewed for the first time, before the minimum is found
 INNER = 0.1  # share of what a renewal unbalanced that Newton leaves before the next one: it will unbalance more
 FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
@@ -98,7 +98,7 @@ class Newton:
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
             least = max(options.tolerance_N, INNER * renewals.added)
             done = report.residual <= (least if report.iterations else FIRST * options.tolerance_N)
-            if done or (renewals.early and report.iterations and report.residual <= EARLY * options.tolerance_N):
+            if done or (renewals.early and report.iterations and report.residual <= EARLY):
                 energy, ended = self._renew(trial, renewals, done=done)
                 if ended:
                     break
