@@ -22,10 +22,11 @@ PATIENCE = 4  # times as many renewals are granted before what they leave makes 
 EARLY = 0.05  # [N] residual at which friction bounds are renewed for the first time, before the minimum is found
 INNER = 0.1  # share of what a renewal unbalanced that Newton leaves before the next one: it will unbalance more
 FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
-SHORTEST = 2.0**-30  # line search gives up below this share of the Newton step
+HALVINGS = 31  # of the Newton step, before the line search gives up
+ENOUGH = 12  # halvings after which it is content with the lowest energy so far
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
 BLURRED = 1e-9  # relative rise of an energy that may be rounding, if the slope along the step falls to
-FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and Zhang, SIAM J. Optim. 16 (2005) 170)
+FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and Zhang, SIAM J. Optim. 16 (2005) 170).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,24 +192,29 @@ class Newton:
     def _search(
         self, trial: State, energy: float, direction: Direction, slope: float
     ) -> tuple[State, float] | None:
-        """Backtrack until Armijo's condition holds, by the parabola through both energies and the slope.
+        """Return where the step ends and its energy [J], with its gradient in the system's derivatives; None: nowhere.
 
-        Returns the state and its energy [J], with its gradient in the system's derivatives.
+        The whole step, if Armijo's condition holds there. Else the interval is halved to where the slope has fallen as
+        well: most steps that fail run across the kink of a friction that is to stick again, where parabolas tell lies,
+        and a sloppy end in front of it makes the next step fail as well. Gradients cost little beside a direction.
         """
-        increment, first = self.increment, True
-        share = self.system.contact.step_limit(trial, direction)
-        size = abs(energy) + increment.scale
-        while share > SHORTEST:
+        increment, size = self.increment, abs(energy) + self.increment.scale
+        low, high = 0.0, 2.0 * self.system.contact.step_limit(trial, direction)
+        best: tuple[State, float] | None = None
+        for tries in range(HALVINGS):
+            share = 0.5 * (low + high)
             moved = trial.moved(direction, share)
-            # most first steps are accepted, and then the gradient is due anyway
-            found = increment.gradient(moved) if first else increment.energy(moved)
-            if found <= energy + ARMIJO * share * slope + ROUNDING * size:
-                return (moved, found) if first else (moved, increment.gradient(moved))
-            if first and found <= energy + BLURRED * size and abs(self._slope(direction)) <= FLATTER * -slope:
+            found = increment.gradient(moved)
+            steep = self._slope(direction) / -slope
+            sinks = found <= energy + ARMIJO * share * slope + ROUNDING * size
+            if sinks and (tries == 0 or abs(steep) <= FLATTER):
                 return moved, found
-            first = False
+            if tries == 0 and found <= energy + BLURRED * size and abs(steep) <= FLATTER:
+                return moved, found
             self.report.line_searches += 1
-            curvature = found - energy - share * slope
-            best = -0.5 * slope * share * share / curvature if np.isfinite(curvature) and curvature > 0.0 else 0.0
-            share = min(max(best, 0.1 * share), 0.5 * share)
-        return None
+            if sinks and (best is None or found < best[1]):
+                best = moved, found
+            elif best is not None and tries >= ENOUGH:
+                break
+            low, high = (share, high) if sinks and steep < 0.0 else (low, share)
+        return None if best is None else (best[0], increment.gradient(best[0]))
