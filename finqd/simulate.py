@@ -50,7 +50,8 @@ class _Recorder:
         """Add up the counters of one attempted step."""
         counted = {
             "steps": int(report.converged), "rejected_steps": int(not report.converged),
-            "newton_iterations": report.iterations, "line_search_steps": report.line_searches,
+            "newton_iterations": report.iterations, "quasi_iterations": report.quasi_iterations,
+            "line_search_steps": report.line_searches,
             "factorisations": report.factorisations, "cg_iterations": report.cg_iterations,
             "projections": report.projections, "friction_updates": report.friction_updates,
             "error_rejections": report.error_rejections, "error_overruns": report.error_overruns,

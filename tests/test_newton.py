@@ -42,7 +42,8 @@ def run(left: Sequence[float], changes: Sequence[float], *, force: float = HEAVY
     system = SimpleNamespace(left=1.0, contact=contact, residual=lambda: (system.left, "the script"))
     increment = SimpleNamespace(gradient=lambda trial: 0.0)
     report = StepReport(residuals=[])
-    Scripted(system=system, increment=increment, options=NewtonOptions(), report=report).minimise(object())
+    options = NewtonOptions(quasi_newton=False)
+    Scripted(system=system, increment=increment, options=options, report=report).minimise(object())
     return report
 
 

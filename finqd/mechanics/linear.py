@@ -307,6 +307,11 @@ class LinearSolver:
             converged=state.converged and finite,
         )
 
+    @property
+    def lagged(self) -> Preconditioner | None:
+        """The exact inverse of an earlier system, which was positive definite, if one is kept."""
+        return self._lagged
+
     def forget(self) -> None:
         """Drop the lagged preconditioner: the next system is known to be a different one."""
         self._lagged = None

@@ -10,6 +10,7 @@ from annotated_types import Ge, Gt, Le, Lt
 
 from finqd.mechanics.incremental import Increment
 from finqd.mechanics.linear import LinearSolution, LinearSolver, make_solver
+from finqd.mechanics.quasi_newton import QuasiNewton, as_direction, as_vector
 from finqd.mechanics.state import Direction, State, StepReport
 from finqd.mechanics.system import System
 
@@ -34,6 +35,7 @@ class NewtonOptions:
     """Options of every stepper that minimises an incremental potential; such a plugin's own come after these.
 
     tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step
+    quasi_newton: whether directions that need no new matrix are tried first (see `finqd.mechanics.quasi_newton`)
     max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal
     max_friction_updates: how often the friction bounds are renewed within a step
     friction_tolerance: share of the friction bounds that may change without a renewal
@@ -43,6 +45,7 @@ class NewtonOptions:
     """
 
     tolerance_N: Annotated[float, Gt(0), Le(1)] = 5e-5
+    quasi_newton: bool = True
     max_iterations: Annotated[int, Ge(1), Le(1000)] = 25
     max_friction_updates: Annotated[int, Ge(0), Le(100)] = 3
     friction_tolerance: Annotated[float, Gt(0), Le(1)] = 0.02
@@ -89,6 +92,7 @@ class Newton:
     def minimise(self, trial: State) -> State:
         """Return the minimum that is found from ``trial``; it is one only if ``report.converged``."""
         report, options, renewals = self.report, self.options, _Renewals()
+        quasi = QuasiNewton(options.solver(self.system).lagged if options.quasi_newton else None)
         energy = self.increment.gradient(trial)
         report.residual, report.where = self.system.residual()
         while True:
@@ -98,9 +102,11 @@ class Newton:
                 break
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
             least = max(options.tolerance_N, INNER * renewals.added)
-            done = report.residual <= (least if report.iterations else FIRST * options.tolerance_N)
-            if done or (renewals.early and report.iterations and report.residual <= EARLY):
+            begun = report.iterations + report.quasi_iterations > 0
+            done = report.residual <= (least if begun else FIRST * options.tolerance_N)
+            if done or (renewals.early and begun and report.residual <= EARLY):
                 energy, ended = self._renew(trial, renewals, done=done)
+                quasi.renewed()
                 if ended:
                     break
                 continue
@@ -108,8 +114,7 @@ class Newton:
                 left = f"{report.residual:.3g} N left on {report.where}"
                 report.reason = f"no equilibrium after {report.iterations} iterations: {left}"
                 break
-            report.iterations += 1
-            moved = self._iterate(trial, energy)
+            moved = self._step(trial, energy, quasi)
             if moved is None:
                 if renewals.best is None and report.residual <= options.tolerance_N:  # at rest, to the last digit
                     renewals.best, renewals.best_jump, report.reason = trial, report.residual, ""
@@ -156,6 +161,39 @@ class Newton:
     def _bound(self) -> float:
         """Return what renewed contact may leave unbalanced at the end of a step [N]."""
         return max(LAG_FORCE, LAG_SHARE * float(np.max(self.system.contact.relagged_forces, initial=0.0)))
+
+    def _step(self, trial: State, energy: float, quasi: QuasiNewton) -> tuple[State, float] | None:
+        """Do one iteration, of the cheap kind while those get on; return as `_iterate` does."""
+        before = self.report.residual
+        if quasi.promises(before):
+            moved = self._try(trial, energy, quasi)
+            if moved is not None:
+                quasi.stepped(before)
+                return moved
+        self.report.iterations += 1
+        found = self._iterate(trial, energy)
+        if self.options.quasi_newton:
+            quasi.replaced(self.options.solver(self.system).lagged, before)
+        return found
+
+    def _try(self, trial: State, energy: float, quasi: QuasiNewton) -> tuple[State, float] | None:
+        """Go the whole way of a quasi-Newton step; None if that is not downhill enough."""
+        d = self.system.derivatives
+        gradient = as_vector(d)
+        vector = quasi.direction(gradient)
+        direction = as_direction(vector, d)
+        slope = float(np.vdot(vector, gradient))
+        if slope >= 0.0 or self.system.contact.step_limit(trial, direction) < 1.0:
+            return None
+        self.report.quasi_iterations += 1
+        moved = trial.moved(direction)
+        found = self.increment.gradient(moved)
+        size = abs(energy) + self.increment.scale
+        if not found <= energy + ARMIJO * slope + ROUNDING * size:
+            self.increment.gradient(trial)
+            return None
+        quasi.learn(vector, as_vector(d) - gradient)
+        return moved, found
 
     def _iterate(self, trial: State, energy: float) -> tuple[State, float] | None:
         """Do one Newton iteration; return where it led, as `_search` does, or None if no direction leads downhill."""

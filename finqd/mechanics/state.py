@@ -73,6 +73,7 @@ class StepReport:
     converged: bool = False
     reason: str = ""
     iterations: int = 0
+    quasi_iterations: int = 0
     line_searches: int = 0
     factorisations: int = 0
     cg_iterations: int = 0
@@ -89,6 +90,9 @@ class StepReport:
 
     def add_work(self, other: StepReport) -> None:
         """Add what another attempt at the same step cost."""
-        counted = ("iterations", "line_searches", "factorisations", "cg_iterations", "projections", "friction_updates")
+        counted = (
+            "iterations", "quasi_iterations", "line_searches", "factorisations", "cg_iterations", "projections",
+            "friction_updates",
+        )
         for name in counted:
             setattr(self, name, getattr(self, name) + getattr(other, name))
