@@ -142,7 +142,8 @@ class WithoutRotationDerivative:
         if not self.wrong_gradient:
             return self.exact.add_gradient(positions, gradient)
         block = self.exact.blocks[0]
-        for nodes, rest, g, stiffness in zip(block.nodes, block.rest, block.gradients, block.stiffness):
+        per_element = block.stiffness[block.kinds]
+        for nodes, rest, g, stiffness in zip(block.nodes, block.rest, block.gradients, per_element):
             x = positions[nodes] - positions[nodes].mean(axis=0)
             rotation = self._rotation(x, g)
             gradient[nodes] += (stiffness @ (x @ rotation - rest).ravel()).reshape(-1, 3) @ rotation.T
@@ -152,7 +153,7 @@ class WithoutRotationDerivative:
         if not self.wrong_hessian:
             return self.exact.add_hessian(positions, slots, blocks, projected=projected)
         block = self.exact.blocks[0]
-        for nodes, g, stiffness, slot in zip(block.nodes, block.gradients, block.stiffness, slots[0]):
+        for nodes, g, stiffness, slot in zip(block.nodes, block.gradients, block.stiffness[block.kinds], slots[0]):
             rotation = self._rotation(positions[nodes], g)
             k = len(nodes)
             turned = np.einsum("pi,aibj,qj->abpq", rotation, stiffness.reshape(k, 3, k, 3), rotation)

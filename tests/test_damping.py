@@ -182,10 +182,10 @@ class Unturned(StepDamping):
     def add_hessian(self, positions: np.ndarray, blocks: np.ndarray, *, projected: bool = False) -> None:
         for block, slots, k in zip(self.damping.viscous, self.damping.slots, self.stiffnesses, strict=True):
             n, m = block.nodes.shape
-            np.add.at(blocks, slots, np.moveaxis(k.reshape(n, m, 3, m, 3), 2, 3))
+            np.add.at(blocks, slots, np.moveaxis(k[block.kinds].reshape(n, m, 3, m, 3), 2, 3))
 
     def _local(self, moved: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        return [(moved[b.nodes].reshape(len(b.nodes), -1), k)
+        return [(moved[b.nodes].reshape(len(b.nodes), -1), k[b.kinds])
                 for b, k in zip(self.damping.viscous, self.stiffnesses, strict=True)]
 
 
@@ -301,7 +301,7 @@ def test_local_shapes_do_not_feel_rigid_motion() -> None:
     nodes = np.asarray(mesh.blocks["hex8"])
     gradients = damping_module.rest_elements("hex8", mesh.vertices[nodes], RUBBER.lame).gradients
     bent = mesh.vertices + 1e-3 * np.sin(300.0 * mesh.vertices[:, ::-1])
-    block = ViscousBlock(nodes, gradients, np.zeros((len(nodes), 24, 24)))
+    block = ViscousBlock(nodes, gradients, np.arange(len(nodes)), np.zeros((len(nodes), 24, 24)))
     here = block.shapes(bent)
     moved = block.shapes(bent @ rotation_matrix(np.array([2.0, -1.0, 0.3])).T + (0.1, 0.2, -0.3))
     assert np.abs(moved - here).max() < 1e-14

@@ -13,7 +13,8 @@ Source: rotation derivative as in Barbic, Exact corotational linear FEM stiffnes
 here for any K and any number of nodes; the rank-six form and W are our own algebra, tested against differences.
 
 Arrays of a block: nodes (n, k) scene vertex ids; rest (n, k, 3) centred rest positions X_a - C [m]; gradients
-(n, k, 3) [1/m]; stiffness (n, 3k, 3k) [N/m]; positions (n_vertices, 3) [m].
+(n, k, 3) [1/m]; kinds (n,): elements of one shape share a stiffness (n_kinds, 3k, 3k) [N/m], as reading it is what
+energies and gradients wait for; positions (n_vertices, 3) [m].
 """
 
 from __future__ import annotations
@@ -77,15 +78,15 @@ def strained(e, nodes, rest, gradients, positions, r, s, y, u):
 
 
 @njit(cache=True)
-def _times(stiffness, e, u, f):
-    """Write f = K u [N] of element e, as sums of rows (K is symmetric), which vectorise."""
+def _times(stiffness, u, f):
+    """Write f = K u [N], as sums of rows (K, ``stiffness``, is symmetric), which vectorise."""
     m = u.shape[0]
     for i in range(m):
         f[i] = 0.0
     for j in range(m):
         uj = u[j]
         for i in range(m):
-            f[i] += stiffness[e, j, i] * uj
+            f[i] += stiffness[j, i] * uj
 
 
 @njit(cache=True)
@@ -156,20 +157,20 @@ def _force(e, gradients, y, f, gi, h, q):
 
 
 @njit(cache=True)
-def energy(nodes, rest, gradients, stiffness, positions):
+def energy(nodes, rest, gradients, kinds, stiffness, positions):
     """Return the energy [J] of a block: sum over elements of 1/2 u^T K u."""
     m = 3 * nodes.shape[1]
     r, s, y, u, f = np.empty((3, 3)), np.empty((3, 3)), np.empty(m), np.empty(m), np.empty(m)
     total = 0.0
     for e in range(nodes.shape[0]):
         strained(e, nodes, rest, gradients, positions, r, s, y, u)
-        _times(stiffness, e, u, f)
+        _times(stiffness[kinds[e]], u, f)
         total += _half_dot(u, f)
     return total
 
 
 @njit(cache=True)
-def add_gradient(nodes, rest, gradients, stiffness, positions, gradient):
+def add_gradient(nodes, rest, gradients, kinds, stiffness, positions, gradient):
     """Add R q_a [N] to gradient (n_vertices, 3) and return the energy [J] of a block."""
     k = nodes.shape[1]
     r, s, g, gi = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -177,7 +178,7 @@ def add_gradient(nodes, rest, gradients, stiffness, positions, gradient):
     total = 0.0
     for e in range(nodes.shape[0]):
         strained(e, nodes, rest, gradients, positions, r, s, y, u)
-        _times(stiffness, e, u, f)
+        _times(stiffness[kinds[e]], u, f)
         total += _half_dot(u, f)
         _inverse_spin(s, g, gi)
         _force(e, gradients, y, f, gi, h, q)
@@ -230,8 +231,8 @@ def _cross_columns(y, sign, c):
 
 
 @njit(cache=True)
-def _times_three(stiffness, e, c, kc):
-    """Write kc = c K for three rows c (3, 3k) of element e (K is symmetric)."""
+def _times_three(stiffness, c, kc):
+    """Write kc = c K for three rows c (3, 3k) (K, ``stiffness``, is symmetric)."""
     m = c.shape[1]
     for i in range(m):
         kc[0, i] = 0.0
@@ -240,7 +241,7 @@ def _times_three(stiffness, e, c, kc):
     for j in range(m):
         c0, c1, c2 = c[0, j], c[1, j], c[2, j]
         for i in range(m):
-            v = stiffness[e, j, i]
+            v = stiffness[j, i]
             kc[0, i] += c0 * v
             kc[1, i] += c1 * v
             kc[2, i] += c2 * v
@@ -286,11 +287,11 @@ def _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, rigid, kq, smal
     Negative eigenvalues of W3 become zero. Where W3 is far below W2 (Q bends an element's soft modes) that would
     stiffen it too much, and Q is scaled down first: the Hessian then stays within the order of the stress.
 
-    compliance: K^+ [m/N], (n, 3k, 3k); q_columns: rows are the columns of Q, (3, 3k)
+    compliance: K^+ [m/N], (3k, 3k); q_columns: rows are the columns of Q, (3, 3k)
     rigid, kq: scratch (3, 3k); small: scratch (2, 3, 3)
     """
     _without_moment(e, rest, gradients, q_columns, rigid)
-    _times_three(compliance, e, rigid, kq)
+    _times_three(compliance, rigid, kq)
     w3, v = small[0], small[1]
     _products(rigid, kq, w3)
     _cross_columns(y, 1.0, kq)
@@ -344,8 +345,8 @@ def _spin_rows(y, kc, q_columns, omega, columns, w, ywy, b):
 
 
 @njit(cache=True)
-def _scatter(e, stiffness, omega, b, r, rows, turned, slots, blocks):
-    """Add R (K + b^T Omega + Omega^T b) R^T [N/m] of element e to blocks (n_blocks + 1, 3, 3), row of nodes by row."""
+def _scatter(stiffness, omega, b, r, rows, turned, slots, blocks):
+    """Add R (K + b^T Omega + Omega^T b) R^T [N/m] of an element to blocks (n_blocks + 1, 3, 3), row of nodes by row."""
     m = omega.shape[1]
     k = m // 3
     r00, r01, r02, r10, r11, r12 = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2]
@@ -355,7 +356,7 @@ def _scatter(e, stiffness, omega, b, r, rows, turned, slots, blocks):
             n = 3 * i + p
             b0, b1, b2, o0, o1, o2 = b[0, n], b[1, n], b[2, n], omega[0, n], omega[1, n], omega[2, n]
             for j in range(3 * i, m):
-                rows[p, j] = (stiffness[e, n, j] + b0 * omega[0, j] + b1 * omega[1, j] + b2 * omega[2, j]
+                rows[p, j] = (stiffness[n, j] + b0 * omega[0, j] + b1 * omega[1, j] + b2 * omega[2, j]
                               + o0 * b[0, j] + o1 * b[1, j] + o2 * b[2, j])
         for j in range(3 * i, m):
             x, y, z = rows[0, j], rows[1, j], rows[2, j]
@@ -363,7 +364,7 @@ def _scatter(e, stiffness, omega, b, r, rows, turned, slots, blocks):
             turned[1, j] = r10 * x + r11 * y + r12 * z
             turned[2, j] = r20 * x + r21 * y + r22 * z
         for j in range(i, k):
-            there, back = slots[e, i, j], slots[e, j, i]
+            there, back = slots[i, j], slots[j, i]
             for p in range(3):
                 x, y, z = turned[p, 3 * j], turned[p, 3 * j + 1], turned[p, 3 * j + 2]
                 x, y, z = r00 * x + r01 * y + r02 * z, r10 * x + r11 * y + r12 * z, r20 * x + r21 * y + r22 * z
@@ -377,11 +378,12 @@ def _scatter(e, stiffness, omega, b, r, rows, turned, slots, blocks):
 
 
 @njit(cache=True)
-def add_hessian(nodes, rest, gradients, stiffness, compliance, positions, slots, blocks, projected):
+def add_hessian(nodes, rest, gradients, kinds, stiffness, compliance, positions, slots, blocks, projected):
     """Add the Hessian [N/m] of a block of elements to blocks (n_blocks + 1, 3, 3); slots (n, k, k).
 
     projected: add each element's smallest spin stiffness that makes its matrix positive semidefinite (`_clamp_spin`);
-    compliance, K^+ [m/N], is read only then. A folded element (`_inverse_spin`) then counts with R K R^T alone.
+    compliance, K^+ [m/N] of each kind, is read only then. A folded element (`_inverse_spin`) then counts with R K R^T
+    alone.
     """
     k = nodes.shape[1]
     m = 3 * k
@@ -392,17 +394,17 @@ def add_hessian(nodes, rest, gradients, stiffness, compliance, positions, slots,
     q_columns, b, rows, turned = np.empty((3, m)), np.empty((3, m)), np.empty((3, m)), np.empty((3, m))
     for e in range(nodes.shape[0]):
         strained(e, nodes, rest, gradients, positions, r, s, y, u)
-        _times(stiffness, e, u, f)
+        _times(stiffness[kinds[e]], u, f)
         regular = _inverse_spin(s, g, gi)
         _force(e, gradients, y, f, gi, h, q)
         _spin_columns(e, gradients, gi, omega)
         _spin_stiffness(y, f, h, g, w)
         _cross_columns(q, -1.0, q_columns)
         if projected:
-            _clamp_spin(e, rest, gradients, compliance, y, q_columns, w, columns, kc, small)
+            _clamp_spin(e, rest, gradients, compliance[kinds[e]], y, q_columns, w, columns, kc, small)
         _cross_columns(y, 1.0, columns)
-        _times_three(stiffness, e, columns, kc)
+        _times_three(stiffness[kinds[e]], columns, kc)
         _spin_rows(y, kc, q_columns, omega, columns, w, ywy, b)
         if projected and not regular:
             omega[:] = 0.0
-        _scatter(e, stiffness, omega, b, r, rows, turned, slots, blocks)
+        _scatter(stiffness[kinds[e]], omega, b, r, rows, turned, slots[e], blocks)

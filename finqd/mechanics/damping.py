@@ -31,7 +31,7 @@ from finqd.errors import InputError
 from finqd.mechanics import corotated_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal
 from finqd.mechanics.damping_kernels import write_local_shapes
-from finqd.mechanics.element_stiffness import rest_elements
+from finqd.mechanics.element_stiffness import kinds_of, rest_elements
 
 if TYPE_CHECKING:
     from finqd.mechanics.incremental import Past
@@ -45,11 +45,16 @@ _NONE = np.zeros((1, 1, 1))
 
 @dataclass(frozen=True, eq=False)
 class ViscousBlock:
-    """Elements of one type: nodes (n, k), gradients (n, k, 3) [1/m], viscosity beta K (n, 3k, 3k) [N s/m]."""
+    """Elements of one type: nodes (n, k), gradients (n, k, 3) [1/m], kinds (n,), their viscosity beta K [N s/m]."""
 
     nodes: np.ndarray
     gradients: np.ndarray
+    kinds: np.ndarray
     viscosity: np.ndarray
+
+    def arrays(self, shapes: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return what the elastic kernels take first, with ``shapes`` (n, k, 3) [m] for the rest positions."""
+        return self.nodes, shapes, self.gradients, self.kinds
 
     def shapes(self, positions: np.ndarray) -> np.ndarray:
         """Return y [m], (n, k, 3), of all elements at ``positions`` (n_vertices, 3) [m]."""
@@ -88,9 +93,10 @@ def _viscous(body: SoftBody) -> list[ViscousBlock]:
         if len(nodes):
             nodes = np.asarray(nodes, dtype=np.int64)
             elements = rest_elements(name, vertices[nodes], material.lame)
+            first, kinds = kinds_of(vertices[nodes] - vertices[nodes].mean(axis=1, keepdims=True))
             blocks.append(ViscousBlock(
                 nodes + body.first_vertex, np.ascontiguousarray(elements.gradients),
-                np.ascontiguousarray(material.rayleigh_stiffness * elements.stiffness),
+                kinds, np.ascontiguousarray(material.rayleigh_stiffness * elements.stiffness[first]),
             ))
     return blocks
 
@@ -132,9 +138,7 @@ class Damping:
         """
         for block, slots in zip(self.viscous, self.slots, strict=True):
             shapes = block.shapes(positions)
-            kernels.add_hessian(
-                block.nodes, shapes, block.gradients, block.viscosity, _NONE, positions, slots, blocks, False
-            )
+            kernels.add_hessian(*block.arrays(shapes), block.viscosity, _NONE, positions, slots, blocks, False)
 
     def stiffnesses(self, h: float) -> tuple[np.ndarray, ...]:
         """Return beta K / h [N/m] of each block, kept from step to step."""
@@ -164,7 +168,7 @@ class StepDamping:
         """Return the dissipation potential [J]."""
         energy = self._drag_energy(positions)
         for block, shapes, stiffness in zip(self.damping.viscous, self.shapes, self.stiffnesses, strict=True):
-            energy += kernels.energy(block.nodes, shapes, block.gradients, stiffness, positions)
+            energy += kernels.energy(*block.arrays(shapes), stiffness, positions)
         return energy
 
     def add_gradient(self, positions: np.ndarray, gradient: np.ndarray) -> float:
@@ -172,7 +176,7 @@ class StepDamping:
         gradient += self.weight * (positions - self.origin)
         energy = self._drag_energy(positions)
         for block, shapes, stiffness in zip(self.damping.viscous, self.shapes, self.stiffnesses, strict=True):
-            energy += kernels.add_gradient(block.nodes, shapes, block.gradients, stiffness, positions, gradient)
+            energy += kernels.add_gradient(*block.arrays(shapes), stiffness, positions, gradient)
         return energy
 
     def add_hessian(self, positions: np.ndarray, blocks: np.ndarray, *, projected: bool = False) -> None:
@@ -183,6 +187,4 @@ class StepDamping:
         add_diagonal(damping.pattern.indptr, self.weight[:, 0], blocks)
         for b, (block, stiffness) in enumerate(zip(damping.viscous, self.stiffnesses, strict=True)):
             shapes = block.shapes(positions) if projected else self.shapes[b]
-            kernels.add_hessian(
-                block.nodes, shapes, block.gradients, stiffness, _NONE, positions, damping.slots[b], blocks, False
-            )
+            kernels.add_hessian(*block.arrays(shapes), stiffness, _NONE, positions, damping.slots[b], blocks, False)

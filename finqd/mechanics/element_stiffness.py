@@ -12,6 +12,7 @@ import numpy as np
 from finqd.errors import MeshError
 from finqd.mechanics.elements import Element, Rule, element, element_rule
 
+SAME = 1e-12  # relative difference of two elements that count as one
 CHUNK = 1000  # elements handled at once: keeps the strain matrices of a large mesh out of memory
 
 HEX20_SHARE = 3e-3  # of the shear modulus: takes the six hourglass modes of the reduced rule off zero
@@ -58,6 +59,17 @@ def rest_elements(name: str, vertices: np.ndarray, lame: tuple[float, float]) ->
         k = kind.n_nodes
         return RestElements(np.zeros((0, 3 * k, 3 * k)), np.zeros((0, k, 3)), np.zeros(0))
     return RestElements(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def kinds_of(rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first element of each shape, and the shape of each element (n,), from rest nodes (n, k, 3).
+
+    The nodes are relative to their centre; two elements have one shape if they agree to `SAME` of the largest.
+    """
+    flat = rest.reshape(len(rest), -1)
+    digits = np.round(flat / (SAME * np.abs(flat).max(initial=np.finfo(float).tiny)))
+    _, first, kinds = np.unique(digits, axis=0, return_index=True, return_inverse=True)
+    return first, kinds.reshape(-1)
 
 
 def physical_gradients(

@@ -122,8 +122,8 @@ class Increment:
         self.damping = system.damping.over(state, past) if system.damping is not None and soft_inertia else None
         #: loads that do not act yet [N], (n_vertices, 3); None: all do
         self.withheld = None if load_share == 1.0 else (1.0 - load_share) * system.forces
-        #: a typical energy [J], for the rounding of differences of energies
-        self.scale = abs(system.energy(state))
+        #: the largest energy [J] met so far, inertia left out: what differences of energies are rounded to
+        self.scale = 0.0
 
     def predicted(self) -> State:
         """Return the lowest of three starts: going on with the last acceleration, with the last velocity, or staying.
@@ -176,12 +176,16 @@ class Increment:
         rigid += np.einsum("bi,bij,bj", off, past.inertias, off)
         return 0.5 * soft + 0.5 * rigid / past.h**2
 
+    def _scaled(self, energy: float) -> float:
+        self.scale = max(self.scale, abs(energy))
+        return energy
+
     def _withheld_energy(self, state: State) -> float:
         return 0.0 if self.withheld is None else float(np.vdot(self.withheld, state.positions))
 
     def energy(self, state: State) -> float:
         """Return the incremental potential [J]."""
-        energy = self._inertia_energy(state, self._turns(state)) + self.system.energy(state)
+        energy = self._scaled(self.system.energy(state)) + self._inertia_energy(state, self._turns(state))
         if self.damping is not None:
             energy += self.damping.energy(state.positions)
         return energy + self._withheld_energy(state)
@@ -191,7 +195,7 @@ class Increment:
         system, d, past = self.system, self.system.derivatives, self.past
         d.clear_gradient()
         turns = self._turns(state)
-        energy = system.add_gradient(state) + self._inertia_energy(state, turns)
+        energy = self._scaled(system.add_gradient(state)) + self._inertia_energy(state, turns)
         d.soft += self.vertex_weight * (state.positions - past.inertial)
         if self.damping is not None:
             energy += self.damping.add_gradient(state.positions, d.soft)

@@ -9,7 +9,7 @@ import numpy as np
 
 from finqd.errors import InputError
 from finqd.mechanics import corotated_kernels as kernels
-from finqd.mechanics.element_stiffness import rest_elements
+from finqd.mechanics.element_stiffness import kinds_of, rest_elements
 
 if TYPE_CHECKING:
     from finqd.mechanics.material import Material
@@ -41,15 +41,22 @@ class RestBlock:
 
     rest: np.ndarray
     gradients: np.ndarray
+    kinds: np.ndarray
     stiffness: np.ndarray
     nodes: np.ndarray
     cache: dict[str, np.ndarray] = field(default_factory=dict, repr=False)  # shared by shifted copies
 
     @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What all kernels take first."""
+        return self.nodes, self.rest, self.gradients, self.kinds, self.stiffness
+
+    @property
     def compliance(self) -> np.ndarray:
-        """Pseudo-inverse of each stiffness [m/N], made when a projected Hessian first asks for it."""
+        """Pseudo-inverse of each kind's stiffness [m/N], made when a projected Hessian first asks for it."""
         if "compliance" not in self.cache:
-            self.cache["compliance"] = _pseudo_inverse(self.stiffness, self.rest)
+            _, first = np.unique(self.kinds, return_index=True)
+            self.cache["compliance"] = _pseudo_inverse(self.stiffness, self.rest[first])
         return self.cache["compliance"]
 
 
@@ -72,13 +79,13 @@ class CorotatedPotential:
 
     def energy(self, positions: np.ndarray) -> float:
         """Return the elastic energy [J] at ``positions`` (n_vertices, 3) [m]."""
-        return sum((kernels.energy(b.nodes, b.rest, b.gradients, b.stiffness, positions) for b in self.blocks), 0.0)
+        return sum((kernels.energy(*b.arrays, positions) for b in self.blocks), 0.0)
 
     def add_gradient(self, positions: np.ndarray, gradient: np.ndarray) -> float:
         """Add dE/dpositions [N] to ``gradient`` (n_vertices, 3); return the energy [J]."""
         total = 0.0
         for b in self.blocks:
-            total += kernels.add_gradient(b.nodes, b.rest, b.gradients, b.stiffness, positions, gradient)
+            total += kernels.add_gradient(*b.arrays, positions, gradient)
         return total
 
     def add_hessian(
@@ -91,19 +98,16 @@ class CorotatedPotential:
         """
         for b, slot in zip(self.blocks, slots, strict=True):
             compliance = b.compliance if projected else _NONE
-            kernels.add_hessian(
-                b.nodes, b.rest, b.gradients, b.stiffness, compliance, positions, slot, blocks, projected
-            )
+            kernels.add_hessian(*b.arrays, compliance, positions, slot, blocks, projected)
 
 
 def _rest_block(name: str, nodes: np.ndarray, vertices: np.ndarray, lame: tuple[float, float]) -> RestBlock:
     elements = rest_elements(name, vertices[nodes], lame)
-    rest = vertices[nodes]
+    rest = vertices[nodes] - vertices[nodes].mean(axis=1, keepdims=True)
+    first, kinds = kinds_of(rest)
     return RestBlock(
-        rest=np.ascontiguousarray(rest - rest.mean(axis=1, keepdims=True)),
-        gradients=np.ascontiguousarray(elements.gradients),
-        stiffness=np.ascontiguousarray(elements.stiffness),
-        nodes=nodes,
+        rest=np.ascontiguousarray(rest), gradients=np.ascontiguousarray(elements.gradients), kinds=kinds,
+        stiffness=np.ascontiguousarray(elements.stiffness[first]), nodes=nodes,
     )
 
 
