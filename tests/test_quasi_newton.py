@@ -9,7 +9,7 @@ import pytest
 
 from finqd import registry
 from finqd.mechanics.material import Material
-from finqd.mechanics.quasi_newton import QUICK, SLOW, QuasiNewton
+from finqd.mechanics.quasi_newton import MOST, QUICK, SLOW, QuasiNewton
 from finqd.mesh_shapes import box_mesh
 from finqd.objects import load_object
 from finqd.scene import Scene
@@ -74,6 +74,9 @@ def test_newton_takes_over_where_the_cheap_steps_stop_to_help(matrix: np.ndarray
     assert quasi.promises(0.99 * QUICK) and not quasi.promises(1.01 * QUICK)
     quasi.renewed()
     assert quasi.promises(100.0)
+    for _ in range(MOST):
+        quasi.stepped(1.0)
+    assert not quasi.promises(0.0)
 
 
 def cantilever(**options: Any) -> Any:

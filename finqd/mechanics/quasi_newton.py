@@ -18,6 +18,7 @@ from finqd.mechanics.system import Derivatives
 
 MEMORY = 12  # changes of the gradient that are remembered
 SLOW = 1.5  # a step that leaves more than this multiple of the residual is followed by one of Newton's: it costs eight
+MOST = 15  # of these in a row, however well they do
 QUICK = 0.3  # one of Newton's that leaves less than this share is followed by one of these
 
 
@@ -27,17 +28,19 @@ class QuasiNewton:
 
     inverse: of an earlier matrix, None if there is none; changes: of the unknowns, of the gradient, and one over their
     product, the latest last; before: the residual before the last step [N], None if anything may be tried;
-    share: of it that may be left
+    share: of it that may be left; row: how many such steps have been done in a row
     """
 
     inverse: Preconditioner | None
     changes: list[tuple[np.ndarray, np.ndarray, float]] = field(default_factory=list)
     before: float | None = None
     share: float = SLOW
+    row: int = 0
 
     def promises(self, residual: float) -> bool:
         """Tell whether the next step may be one of these, given the ``residual`` that the last one left."""
-        return self.inverse is not None and (self.before is None or residual <= self.share * self.before)
+        gets_on = self.before is None or residual <= self.share * self.before
+        return self.inverse is not None and self.row < MOST and gets_on
 
     def direction(self, gradient: np.ndarray) -> np.ndarray:
         """Return minus the inverse, corrected by what has been learnt, times ``gradient`` (3 n + m,)."""
@@ -59,17 +62,17 @@ class QuasiNewton:
 
     def stepped(self, residual: float) -> None:
         """Note a step of this kind from a state with ``residual`` [N]."""
-        self.before, self.share = residual, SLOW
+        self.before, self.share, self.row = residual, SLOW, self.row + 1
 
     def replaced(self, inverse: Preconditioner | None, residual: float) -> None:
         """Note a step of Newton's from a state with ``residual`` [N], which may have brought a better ``inverse``."""
         if inverse is not self.inverse:
             self.changes = []
-        self.inverse, self.before, self.share = inverse, residual, QUICK
+        self.inverse, self.before, self.share, self.row = inverse, residual, QUICK, 0
 
     def renewed(self) -> None:
         """Note that contact was renewed: another problem, though a similar one."""
-        self.before = None
+        self.before, self.row = None, 0
 
 
 def as_vector(derivatives: Derivatives) -> np.ndarray:
