@@ -6,10 +6,12 @@ Cases with closed forms or published values are in `finqd.verification`; `test_v
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from finqd import registry
 from finqd.errors import InputError
 from finqd.mechanics.state import State
 from finqd.mechanics.system import System
@@ -225,3 +227,25 @@ def test_a_held_body_stays_and_bears_what_is_pressed_on_it(stepper: str) -> None
     assert found.contact_forces[-1, 0] >= -force[2]  # normal forces fan out around a ball: their sum is larger
     with pytest.raises(InputError, match="sphere 2: a rigid body that is held must not have a velocity"):
         scene.add_rigid(ball, position=(0.0, 0.0, 1.0), velocity=(0.0, 0.0, 1.0), name="sphere 2", held=True)
+
+
+def test_forces_that_are_kept_are_those_of_the_state_that_is_asked_for() -> None:
+    """Renewing contact asks again at one state; the elastic forces found there must not be used anywhere else."""
+    def forces(system: System, state: State) -> tuple[float, np.ndarray, float]:
+        system.derivatives.clear_gradient()
+        energy = system.add_gradient(state)
+        return energy, system.derivatives.soft.copy(), system.elastic_energy(state.positions)
+
+    scene = Scene()
+    scene.add_soft(box_mesh((0.03, 0.02, 0.01), (2, 2, 1)), RUBBER)
+    system = System(scene, contact=registry.create("contact", "penalty"))
+    start = system.initial_state()
+    rng = np.random.default_rng(2)
+    states = [replace(start, positions=start.positions + 1e-4 * rng.normal(size=start.positions.shape)) for _ in "ab"]
+    for i in (0, 0, 1, 1, 0):
+        fresh = System(scene, contact=registry.create("contact", "penalty"))
+        for each in (system, fresh):
+            each.contact.begin_step(start)
+        for found, wanted in zip(forces(system, states[i]), forces(fresh, states[i]), strict=True):
+            assert np.array_equal(found, wanted)
+    assert forces(system, states[0])[2] != forces(system, states[1])[2]

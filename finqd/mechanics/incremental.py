@@ -141,7 +141,7 @@ class Increment:
                 start.rigid_velocities + ratio * (start.rigid_velocities - before.rigid_velocities),
                 start.angular_momenta + ratio * (start.angular_momenta - before.angular_momenta),
             )
-            if self.energy(bent) < energy:
+            if self.gradient(bent) < energy:  # no dearer than the energy, as the minimisation begins with it
                 return bent
         still = self._driven(start)
         return still if self.energy(still) < energy else moving

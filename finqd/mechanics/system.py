@@ -86,6 +86,9 @@ class System:
             soft=np.zeros((n, 3)), rigid=np.zeros((m, 6)), blocks=self.pattern.new_blocks(),
             coupling=np.zeros((3 * n, 6 * m)), rigid_matrix=np.zeros((6 * m, 6 * m)),
         )
+        # where the elastic gradient was taken last, and what it was: contact is renewed without anything moving
+        self._strained: np.ndarray | None = None
+        self._elastic, self._elastic_energy = np.zeros((n, 3)), 0.0
         self.shortest_step = 0.0
         self.solvers: dict[tuple, object] = {}  # of the steppers, by their settings: they keep lagged factorisations
 
@@ -138,7 +141,18 @@ class System:
 
     def elastic_energy(self, positions: np.ndarray) -> float:
         """Return the elastic energy of all soft bodies [J]."""
+        if positions is self._strained:
+            return self._elastic_energy
         return sum(p.energy(positions) for p in self.potentials)
+
+    def _strain(self, positions: np.ndarray) -> None:
+        """Find elastic energy and gradient, unless they are those of this very array (which is never written to)."""
+        if positions is self._strained:
+            return
+        self._strained = None
+        self._elastic[:] = 0.0
+        self._elastic_energy = sum(p.add_gradient(positions, self._elastic) for p in self.potentials)
+        self._strained = positions
 
     def energy(self, state: State) -> float:
         """Return elastic, contact, friction and dead-load energy [J]."""
@@ -151,8 +165,9 @@ class System:
         d.soft -= self.forces
         d.rigid[:, :3] -= self.rigid_forces
         energy = -np.vdot(self.forces, state.positions) - np.vdot(self.rigid_forces, state.rigid_positions)
-        energy += sum(potential.add_gradient(state.positions, d.soft) for potential in self.potentials)
-        return energy + self.contact.add_gradient(state, d)
+        self._strain(state.positions)
+        d.soft += self._elastic
+        return energy + self._elastic_energy + self.contact.add_gradient(state, d)
 
     def add_hessian(self, state: State, *, projected: bool = False) -> None:
         """Add the Hessian of `energy` to `derivatives`; ``projected``: a positive semidefinite one."""

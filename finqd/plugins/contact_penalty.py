@@ -280,7 +280,11 @@ class PenaltyContact:
 
     def _find(self, state: State) -> None:
         """Fill `rows` with all contacts at ``state``, unless they are there already."""
-        if self._rows_state is state:
+        at = self._rows_state
+        if at is state or (
+            at is not None and at.positions is state.positions and at.rigid_positions is state.rigid_positions
+            and at.rigid_rotations is state.rigid_rotations
+        ):
             return
         while True:
             count = self._fill(state)
