@@ -216,7 +216,7 @@ def _newton() -> list[Rung]:
     return [
         _rung("newton", "Newton tolerance", f"tolerance {force:g} N", {"stepper.tolerance_N": force})
         for force in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-    ]
+    ] + [_rung("newton", "quasi-Newton steps", "a new matrix each iteration", {"stepper.quasi_newton": False})]
 
 
 def _linear() -> list[Rung]:
