@@ -260,6 +260,6 @@ def _require_backend(rung: Rung) -> None:
 
 
 def _plain(value: Any) -> str:
-    if value is None:
-        return "null"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
     return f"{value:g}" if isinstance(value, float) else str(value)
