@@ -94,7 +94,7 @@ def test_the_motion_is_the_same_for_fewer_matrices() -> None:
     cheap, plain = cantilever(), cantilever(quasi_newton=False)
     assert cheap.status == plain.status == "ok"
     assert plain.counters["quasi_iterations"] == 0 < cheap.counters["quasi_iterations"]
-    assert cheap.counters["newton_iterations"] < 0.6 * plain.counters["newton_iterations"]
+    assert cheap.counters["newton_iterations"] < 0.8 * plain.counters["newton_iterations"]
     ends, starts = plain.soft_positions[-1], plain.soft_positions[0]
     moved = np.abs(ends - starts).max()
     assert moved > 1e-3

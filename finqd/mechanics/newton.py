@@ -26,7 +26,7 @@ FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 HALVINGS = 31  # of the Newton step, before the line search gives up
 ENOUGH = 12  # halvings after which it is content with the lowest energy so far
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
-BLURRED = 1e-9  # relative rise of an energy that may be rounding, if the slope along the step falls to
+BLURRED = 1e-6  # relative rise of an energy that may be rounding, if the slope along the step falls to
 FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and Zhang, SIAM J. Optim. 16 (2005) 170).
 
 
