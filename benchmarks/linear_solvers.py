@@ -83,7 +83,7 @@ def backend_table(pattern: BlockPattern, system: Newton, repeat: int) -> None:
     matrix = CoupledMatrix(pattern, system.blocks, system.coupling, system.rigid)
     x = np.ones(matrix.size)
     matrix.product(x)
-    print(f"{3 * pattern.n_vertices} soft and {len(system.rigid)} rigid unknowns, {9 * pattern.n_blocks} non-zeros")
+    print(f"{3 * pattern.n_vertices} soft and {len(system.rigid)} rigid unknowns, {9 * pattern.n_blocks} numbers")
     print(f"product with the coupled matrix: {fastest(lambda: matrix.product(x), 5 * repeat):.2f} ms\n")
     print("| backend | first factorisation | next ones | solve, 1 | solve, 7 | entries of L |")
     print("|---|---|---|---|---|---|")

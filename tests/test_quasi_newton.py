@@ -104,3 +104,14 @@ def test_the_motion_is_the_same_for_fewer_matrices() -> None:
 def test_without_a_factorisation_there_is_nothing_to_start_from() -> None:
     found = cantilever(preconditioner="jacobi")
     assert found.status == "ok" and found.counters["quasi_iterations"] == 0
+
+
+def test_a_trial_of_infinite_energy_does_not_switch_the_line_search_off() -> None:
+    """An inverted element costs infinite energy in `neo_hookean`; a load that overshoots must still find its rest."""
+    scene = Scene(gravity=(0.0, 0.0, 0.0))
+    body = scene.add_soft(box_mesh((0.01, 0.01, 0.02), (2, 2, 4)), RUBBER, elasticity="neo_hookean")
+    body.fix("zmin")
+    body.load("zmax", (18.0, 0.0, 60.0))
+    stepper = registry.create("stepper", "implicit_euler")
+    found = simulate(scene, duration=0.02, time_step=0.02, stepper=stepper, contact="penalty")
+    assert found.status == "ok" and found.counters["rejected_steps"] == 0, found.reason

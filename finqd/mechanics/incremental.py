@@ -122,14 +122,15 @@ class Increment:
         self.damping = system.damping.over(state, past) if system.damping is not None and soft_inertia else None
         #: loads that do not act yet [N], (n_vertices, 3); None: all do
         self.withheld = None if load_share == 1.0 else (1.0 - load_share) * system.forces
-        #: the largest energy [J] met so far, inertia left out: what differences of energies are rounded to
-        self.scale = 0.0
+        #: a typical energy [J], for the rounding of differences of energies
+        self.scale = abs(system.energy(state))
 
     def predicted(self) -> State:
-        """Return the lowest of three starts: going on with the last acceleration, with the last velocity, or staying.
+        """Return where to start: going on with the last acceleration, or with the last velocity, or staying.
 
         Driven vertices are at their targets in all of them. The first is the nearest, by one order of the step, where
-        motion is smooth; after an impact the last acceleration means nothing.
+        motion is smooth; after an impact the last acceleration means nothing, and where its energy is not below that of
+        the second, the lower one of the others is taken.
         """
         start = self.start
         moving = self._start(start.velocities, start.rigid_velocities, start.angular_momenta)
@@ -176,16 +177,12 @@ class Increment:
         rigid += np.einsum("bi,bij,bj", off, past.inertias, off)
         return 0.5 * soft + 0.5 * rigid / past.h**2
 
-    def _scaled(self, energy: float) -> float:
-        self.scale = max(self.scale, abs(energy))
-        return energy
-
     def _withheld_energy(self, state: State) -> float:
         return 0.0 if self.withheld is None else float(np.vdot(self.withheld, state.positions))
 
     def energy(self, state: State) -> float:
         """Return the incremental potential [J]."""
-        energy = self._scaled(self.system.energy(state)) + self._inertia_energy(state, self._turns(state))
+        energy = self._inertia_energy(state, self._turns(state)) + self.system.energy(state)
         if self.damping is not None:
             energy += self.damping.energy(state.positions)
         return energy + self._withheld_energy(state)
@@ -195,7 +192,7 @@ class Increment:
         system, d, past = self.system, self.system.derivatives, self.past
         d.clear_gradient()
         turns = self._turns(state)
-        energy = self._scaled(system.add_gradient(state)) + self._inertia_energy(state, turns)
+        energy = system.add_gradient(state) + self._inertia_energy(state, turns)
         d.soft += self.vertex_weight * (state.positions - past.inertial)
         if self.damping is not None:
             energy += self.damping.add_gradient(state.positions, d.soft)

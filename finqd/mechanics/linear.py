@@ -329,7 +329,9 @@ class LinearSolver:
         try:
             inverse = CoupledInverse(self._factorisation, matrix)
         except np.linalg.LinAlgError:
+            self._lagged = None
             return _Iterate(np.zeros(len(rhs)), definite=False), True
+        self._lagged = inverse if inverse.positive else None  # for quasi-Newton steps
         return _solve_directly(matrix, inverse, rhs), True
 
     def _lagged_cg(self, matrix: CoupledMatrix, rhs: np.ndarray, tolerance: float) -> tuple[_Iterate, bool]:

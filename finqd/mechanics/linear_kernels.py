@@ -89,7 +89,6 @@ def gather(values, source, taken):
         taken[i] = values[source[i]]
 
 
-
 @njit(cache=True)
 def transposed_product(matrix, x, product):
     """Write ``matrix^T x`` to ``product``: shapes (n, m), (n,), (m,)."""

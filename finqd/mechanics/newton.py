@@ -36,7 +36,8 @@ class NewtonOptions:
 
     tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step
     quasi_newton: whether directions that need no new matrix are tried first (see `finqd.mechanics.quasi_newton`)
-    max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal
+    max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal.
+        Quasi-Newton steps are not counted
     max_friction_updates: how often the friction bounds are renewed within a step
     friction_tolerance: share of the friction bounds that may change without a renewal
     linear_solver, preconditioner, backend: see `finqd.mechanics.linear`
@@ -101,10 +102,9 @@ class Newton:
                 report.reason = f"the forces are no longer finite ({report.where})"
                 break
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
-            least = max(options.tolerance_N, INNER * renewals.added)
             begun = report.iterations + report.quasi_iterations > 0
-            done = report.residual <= (least if begun else FIRST * options.tolerance_N)
-            if done or (renewals.early and begun and report.residual <= EARLY):
+            done = report.residual <= (1.0 if begun else FIRST) * options.tolerance_N
+            if done or (begun and self._renewal_is_due(renewals)):
                 energy, ended = self._renew(trial, renewals, done=done)
                 quasi.renewed()
                 if ended:
@@ -126,6 +126,13 @@ class Newton:
             report.reason = report.reason or f"friction did not come to rest: {left}"
             return trial
         return self._accept(renewals.best, renewals.best_jump)
+
+    def _renewal_is_due(self, renewals: _Renewals) -> bool:
+        """Tell whether friction bounds are better renewed now, though this is no minimum yet: it will move."""
+        report = self.report
+        if renewals.early:
+            return report.residual <= EARLY
+        return report.friction_updates < self.options.max_friction_updates and report.residual <= INNER * renewals.added
 
     def _renew(self, trial: State, renewals: _Renewals, *, done: bool) -> tuple[float, bool]:
         """Renew what contact lags at ``trial``, a minimum if ``done``; return its energy, and whether the step ends."""
@@ -183,7 +190,8 @@ class Newton:
         vector = quasi.direction(gradient)
         direction = as_direction(vector, d)
         slope = float(np.vdot(vector, gradient))
-        if slope >= 0.0 or self.system.contact.step_limit(trial, direction) < 1.0:
+        if not slope < 0.0 or self.system.contact.step_limit(trial, direction) < 1.0:
+            quasi.forget()
             return None
         self.report.quasi_iterations += 1
         moved = trial.moved(direction)
@@ -191,8 +199,9 @@ class Newton:
         size = abs(energy) + self.increment.scale
         if not found <= energy + ARMIJO * slope + ROUNDING * size:
             self.increment.gradient(trial)
+            quasi.forget()
             return None
-        quasi.learn(vector, as_vector(d) - gradient)
+        quasi.learn(vector, as_vector(d) - gradient, least=-slope)
         return moved, found
 
     def _iterate(self, trial: State, energy: float) -> tuple[State, float] | None:
@@ -254,5 +263,8 @@ class Newton:
                 best = moved, found
             elif best is not None and tries >= ENOUGH:
                 break
-            low, high = (share, high) if sinks and steep < 0.0 else (low, share)
+            if sinks and steep < 0.0:
+                low = share
+            else:
+                high = share if np.isfinite(found) else low + 0.2 * (share - low)
         return None if best is None else (best[0], increment.gradient(best[0]))

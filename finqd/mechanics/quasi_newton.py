@@ -18,6 +18,7 @@ from finqd.mechanics.system import Derivatives
 
 MEMORY = 12  # changes of the gradient that are remembered
 SLOW = 1.5  # a step that leaves more than this multiple of the residual is followed by one of Newton's: it costs eight
+NOTHING = 1e-6  # curvature that teaches nothing, as a share of the expected one
 MOST = 15  # of these in a row, however well they do
 QUICK = 0.3  # one of Newton's that leaves less than this share is followed by one of these
 
@@ -54,11 +55,18 @@ class QuasiNewton:
             found += (products.pop() - weight * dot(turn, found)) * step
         return -found
 
-    def learn(self, step: np.ndarray, turn: np.ndarray) -> None:
-        """Remember that the gradient changed by ``turn`` over ``step``, where that is no negative curvature."""
+    def learn(self, step: np.ndarray, turn: np.ndarray, *, least: float = 0.0) -> None:
+        """Remember that the gradient changed by ``turn`` over ``step``, where that is clearly a positive curvature.
+
+        least: what the step was to gain [J]; a product that is nothing beside it is rounding
+        """
         product = dot(step, turn)
-        if product > 0.0:
+        if product > NOTHING * least:
             self.changes = [*self.changes[1 - MEMORY :], (step, turn, 1.0 / product)]
+
+    def forget(self) -> None:
+        """Drop what was learnt: it has led astray."""
+        self.changes = []
 
     def stepped(self, residual: float) -> None:
         """Note a step of this kind from a state with ``residual`` [N]."""
