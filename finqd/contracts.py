@@ -96,7 +96,10 @@ class ElasticPotential(Protocol):
         """Return the elastic energy [J]; ``positions`` [m], (n_vertices, 3). May be inf for an inverted element."""
 
     def add_gradient(self, positions: np.ndarray, gradient: np.ndarray) -> float:
-        """Add dE/dpositions [N] to ``gradient``, shape (n_vertices, 3), and return the energy [J]."""
+        """Add dE/dpositions [N] to ``gradient``, shape (n_vertices, 3), and return the energy [J].
+
+        Also asked at trial states that are then rejected: inf (or NaN) is a fair answer for an inverted element.
+        """
 
     def add_hessian(
         self, positions: np.ndarray, slots: tuple[np.ndarray, ...], blocks: np.ndarray, *, projected: bool = False
