@@ -26,7 +26,8 @@ DEFAULT = "standard"
 #: the press by far
 _QUARTER: dict[str, Any] = {"order": 2, "notch_nodes": "quarter"}
 
-#: Residuals of a thousandth of a light object's weight: in the press as good as any smaller ones, in seven digits
+#: At most a three-hundredth of a light object's weight. In the press as good as any smaller one, in seven digits; an
+#: object that slides freely is off by that share of its weight
 _LIGHT: dict[str, Any] = {name: {"tolerance_N": 5e-4} for name in ("implicit_euler", "bdf2", "quasi_static")}
 
 #: preset -> section -> options by plugin, of which the preset chooses the first; the protocol has no plugin

@@ -11,7 +11,7 @@ import pytest
 
 from finqd.mechanics import newton
 from finqd.mechanics.newton import Newton, NewtonOptions
-from finqd.mechanics.state import StepReport
+from finqd.mechanics.state import Direction, StepReport
 
 HEAVY, LIGHT = 5.0, 0.5 * newton.LAG_FORCE  # [N] contact force
 
@@ -84,3 +84,25 @@ def test_patience_ends() -> None:
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_what_may_stay_unbalanced_is_a_share_of_the_contact_force(share: float) -> None:
     assert run([share * newton.LAG_SHARE * HEAVY], [0.1]).converged == (share < 1.0)
+
+
+def test_a_search_across_a_kink_ends_at_the_kink() -> None:
+    """The energy falls to 0.26 of the step and rises steeply behind: an end in front of it would be a crawl."""
+    kink, width, rise = 0.26, 0.004, 100.0
+    derivatives = SimpleNamespace(soft=np.zeros(1), rigid=np.zeros(0))
+
+    def gradient(at: SimpleNamespace) -> float:
+        past = np.clip(at.x - kink, 0.0, width)
+        derivatives.soft = np.array([-1.0 + rise * past / width])
+        return float(-at.x + 0.5 * rise * past**2 / width + rise * max(at.x - kink - width, 0.0))
+
+    def state(x: float) -> SimpleNamespace:
+        return SimpleNamespace(x=x, moved=lambda direction, share=1.0: state(x + share * direction.soft[0]))
+
+    system = SimpleNamespace(derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
+    increment, report = SimpleNamespace(gradient=gradient, scale=1.0), StepReport(residuals=[])
+    search = Newton(system=system, increment=increment, options=NewtonOptions(), report=report)._search
+    energy = gradient(state(0.0))
+    moved, found = search(state(0.0), energy, Direction(soft=np.ones(1), rigid=np.zeros(0)), -1.0)
+    assert kink - width < moved.x < kink + width and found == gradient(moved) < energy
+    assert report.line_searches <= newton.ENOUGH + 1

@@ -9,6 +9,7 @@ import pytest
 
 from finqd import registry
 from finqd.mechanics.material import Material
+from finqd.mechanics.newton import Newton
 from finqd.mechanics.quasi_newton import MOST, QUICK, SLOW, QuasiNewton
 from finqd.mesh_shapes import box_mesh
 from finqd.objects import load_object
@@ -99,6 +100,25 @@ def test_the_motion_is_the_same_for_fewer_matrices() -> None:
     moved = np.abs(ends - starts).max()
     assert moved > 1e-3
     assert np.abs(cheap.soft_positions[-1] - ends).max() < 1e-3 * moved
+
+
+@pytest.mark.parametrize("quasi", [True, False])
+def test_a_step_ends_only_within_the_tolerance_of_the_friction_bounds_it_was_solved_with(
+    quasi: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Renewals may come before a minimum, ends may not."""
+    original, left = Newton._renew, []
+
+    def watched(self: Newton, *arguments: Any, **options: Any) -> tuple[float, bool]:
+        before = self.report.residual
+        energy, ended = original(self, *arguments, **options)
+        left.append((before, ended))
+        return energy, ended
+
+    monkeypatch.setattr(Newton, "_renew", watched)
+    assert cantilever(quasi_newton=quasi).status == "ok"
+    assert max(before for before, ended in left if ended) <= 1e-6
+    assert any(before > 1e-6 for before, _ in left), "or this test says nothing"
 
 
 def test_without_a_factorisation_there_is_nothing_to_start_from() -> None:

@@ -29,10 +29,8 @@ from finqd.verification.press import press_finger, touching_centre
 
 #: `press` has no fast twin, and these two are whole grasps
 FAST = [name for name in catalogue.CATALOGUE if name not in (*catalogue.SLOW, "press")]
-
-
 #: rows that the README names: a viscous law damps silicone wrongly, and the recorded bars were not let go at once
-KNOWN_MISSES = {"silicone-release": 3}
+KNOWN_MISSES = {"silicone-release": ["0.51 N: ring-down, damping ratio", " 0 N: first peak", "0.51 N: first peak"]}
 
 
 def missed(rows: list[Row]) -> list[str]:
@@ -49,7 +47,8 @@ def test_a_fast_twin_stays_inside_its_bands(name: str) -> None:
 @pytest.mark.parametrize("name", [*FAST, "press"])
 def test_a_case_stays_inside_its_bands(name: str) -> None:
     found = [row.quantity for row in map(measure, cases([name])) if not row.passed]
-    assert len(found) == KNOWN_MISSES.get(name, 0), found
+    known = KNOWN_MISSES.get(name, [])
+    assert len(found) == len(known) and all(row.endswith(end) for row, end in zip(found, known)), found
 
 
 @pytest.mark.parametrize("element", elastic.ELEMENTS)

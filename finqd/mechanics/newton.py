@@ -34,7 +34,8 @@ FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and 
 class NewtonOptions:
     """Options of every stepper that minimises an incremental potential; such a plugin's own come after these.
 
-    tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step
+    tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step, at the friction bounds that
+        it was solved with; the bounds of its end may leave more, by `LAG_FORCE` and `LAG_SHARE`
     quasi_newton: whether directions that need no new matrix are tried first (see `finqd.mechanics.quasi_newton`)
     max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal.
         Quasi-Newton steps are not counted
@@ -261,7 +262,7 @@ class Newton:
             self.report.line_searches += 1
             if sinks and (best is None or found < best[1]):
                 best = moved, found
-            elif best is not None and tries >= ENOUGH:
+            if best is not None and tries >= ENOUGH:
                 break
             if sinks and steep < 0.0:
                 low = share
