@@ -26,20 +26,14 @@ DEFAULT = "standard"
 #: the press by far
 _QUARTER: dict[str, Any] = {"order": 2, "notch_nodes": "quarter"}
 
-#: At most a three-hundredth of a light object's weight. In the press as good as any smaller one, in seven digits; an
-#: object that slides freely is off by that share of its weight
-_LIGHT: dict[str, Any] = {name: {"tolerance_N": 5e-4} for name in ("implicit_euler", "bdf2", "quasi_static")}
-
 #: preset -> section -> options by plugin, of which the preset chooses the first; the protocol has no plugin
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "mesher": {"swept": {"size_mm": 4.0, "layers": 1, **_QUARTER}, "tetrahedral": {"size_mm": 6.0}},
-        "stepper": _LIGHT,
         "protocol": {"time_step_ms": 20.0},
     },
     "standard": {
         "mesher": {"swept": {"size_mm": 2.5, "layers": 2, **_QUARTER}, "tetrahedral": {"size_mm": 4.0}},
-        "stepper": _LIGHT,
         "protocol": {"time_step_ms": 10.0},
     },
     "fine": {

@@ -142,7 +142,7 @@ def test_what_no_study_has_measured_is_named_by_none(studied):
     ({"mesher.size_mm": 5}, "does not apply: mesher.size_mm is 5, not 2.5"),
     ({"mesher.layers": 1}, "does not apply: mesher.layers is 1, not 2"),
     ({"mesher": "tetrahedral"}, "does not apply: mesher is tetrahedral, not swept"),
-    ({"stepper.tolerance_N": 0.01}, "does not apply: stepper.tolerance_N is 0.01, not 0.0005"),
+    ({"stepper.tolerance_N": 0.01}, "does not apply: stepper.tolerance_N is 0.01, not 5e-05"),
     ({"protocol.time_step_ms": 20}, "does not apply: protocol.time_step_ms is 20, not 10"),
     ({"material.poisson_ratio": 0.3}, "does not apply: measured with a Poisson's ratio of 0.49"),
 ])
