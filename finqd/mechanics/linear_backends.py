@@ -236,35 +236,30 @@ class CholmodFactorisation:
 
 
 class PardisoFactorisation:
-    """MKL's Pardiso: supernodal Cholesky, and Bunch-Kaufman L D L^T where the matrix turns out to be indefinite."""
+    """MKL's Pardiso: supernodal Cholesky; stops at an indefinite matrix."""
 
     factor_cost: ClassVar[float] = 0.05
     column_cost: ClassVar[float] = 0.25
 
     def __init__(self, pattern: BlockPattern) -> None:
         self._rows = Rows(pattern, "upper")
-        self._positive = _Pardiso(self._rows, 2)
-        self._indefinite: _Pardiso | None = None
-        self._current = self._positive
+        self._pardiso = _Pardiso(self._rows)
         self.factor_entries = 0
 
     def factorise(self, blocks: np.ndarray) -> bool:
         """See `Factorisation`."""
         self._rows.fill(blocks)
-        if self._positive.factorise():
-            self._current = self._positive
-            self.factor_entries = int(self._positive.parameters[17])
-            return True
-        if self._indefinite is None:
-            self._indefinite = _Pardiso(self._rows, -2)
-        self._current = self._indefinite
-        if not self._indefinite.factorise() or self._indefinite.parameters[13] > 0:  # perturbed pivots
-            raise np.linalg.LinAlgError("the matrix is singular")
-        return bool(self._indefinite.parameters[22] == 0)
+        if not self._pardiso.factorise():
+            raise np.linalg.LinAlgError("the matrix is not positive definite")
+        self.factor_entries = int(self._pardiso.parameters[17])
+        return True
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """See `Factorisation`."""
-        return self._current.solve(rhs)
+        return self._pardiso.solve(rhs)
+
+
+_POSITIVE = 2  # the manual's type of a real symmetric positive definite matrix
 
 
 class _Pardiso:
@@ -273,16 +268,14 @@ class _Pardiso:
     The parameters are those of the manual, counted from zero here ("Intel oneMKL developer reference, pardiso iparm").
     """
 
-    def __init__(self, rows: Rows, matrix_type: int) -> None:
+    def __init__(self, rows: Rows) -> None:
         self._handle = np.zeros(64, np.int64)
         self.parameters = np.zeros(64, np.int32)
         self.parameters[0] = 1  # take the values below, no defaults
         self.parameters[1] = 0  # minimum degree: less fill than METIS on chains of thin walls (measured)
-        self.parameters[9] = 8  # pivots below 1e-8 |A| are perturbed
         self.parameters[17] = -1  # report the entries of the factor
-        self.parameters[20] = 1  # Bunch-Kaufman pivots
         self.parameters[34] = 1  # indices from zero
-        self._arguments = (self._handle, self.parameters, rows, matrix_type)
+        self._arguments = (self._handle, self.parameters, rows)
         self._release: weakref.finalize | None = None
 
     def factorise(self) -> bool:
@@ -313,7 +306,6 @@ def _call_pardiso(
     handle: np.ndarray,
     parameters: np.ndarray,
     rows: Rows,
-    matrix_type: int,
     rhs: np.ndarray | None = None,
     solution: np.ndarray | None = None,
 ) -> int:
@@ -328,7 +320,7 @@ def _call_pardiso(
     error = ctypes.c_int32(0)
     columns = 1 if rhs is None or rhs.ndim == 1 else rhs.shape[1]
     _mkl().pardiso(
-        pointer(handle), integer(1), integer(1), integer(matrix_type), integer(phase), integer(rows.size),
+        pointer(handle), integer(1), integer(1), integer(_POSITIVE), integer(phase), integer(rows.size),
         pointer(rows.values), pointer(rows.indptr), pointer(rows.indices), None, integer(columns),
         pointer(parameters), integer(0), pointer(rhs), pointer(solution), ctypes.byref(error),
     )  # fmt: skip

@@ -224,8 +224,10 @@ class Newton:
         return None
 
     def _solve(self) -> LinearSolution:
-        d = self.system.derivatives
-        solution = self.options.solver(self.system).solve(
+        d, solver = self.system.derivatives, self.options.solver(self.system)
+        if self.options.quasi_newton:  # what it kept has just been found to be too old
+            solver.forget()
+        solution = solver.solve(
             d.blocks, d.coupling, d.rigid_matrix, -d.soft, -d.rigid, tolerance=self.options.linear_tolerance
         )
         self.report.cg_iterations += solution.iterations
