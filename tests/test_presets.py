@@ -143,7 +143,7 @@ def test_what_no_study_has_measured_is_named_by_none(studied):
     ({"mesher.layers": 1}, "does not apply: mesher.layers is 1, not 2"),
     ({"mesher": "tetrahedral"}, "does not apply: mesher is tetrahedral, not swept"),
     ({"stepper.tolerance_N": 0.01}, "does not apply: stepper.tolerance_N is 0.01, not 5e-05"),
-    ({"protocol.time_step_ms": 20}, "does not apply: protocol.time_step_ms is 20, not 10"),
+    ({"protocol.time_step_ms": 30}, "does not apply: protocol.time_step_ms is 30, not 20"),
     ({"material.poisson_ratio": 0.3}, "does not apply: measured with a Poisson's ratio of 0.49"),
 ])
 def test_it_does_not_apply_to_what_was_not_studied(studied, overrides, sentence):
