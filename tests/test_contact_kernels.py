@@ -191,7 +191,7 @@ def test_soft_step_limit_lets_no_point_pass_the_allowance() -> None:
     nothing, limits = np.zeros(3), []
     for direction, shift in ((up, nothing), (np.zeros_like(up), -up[0])):
         limits.append(kernels.soft_step_limit(
-            mesh.vertices, direction, surface.faces, centre, np.eye(3), ball.distance, 0.005, shift, nothing, 5e-4
+            mesh.vertices, direction, *surface.lattices, centre, np.eye(3), ball.distance, 0.005, shift, nothing, 5e-4
         ))
     assert limits[0] == pytest.approx(limits[1], rel=1e-12) and 0.0 < limits[0] < 1.0
     moved = mesh.vertices + limits[0] * up
@@ -202,9 +202,45 @@ def test_soft_step_limit_lets_no_point_pass_the_allowance() -> None:
     ]
     assert max(depths) <= 5e-4 + 1e-12
     small = kernels.soft_step_limit(
-        mesh.vertices, 0.02 * up, surface.faces, centre, np.eye(3), ball.distance, 0.005, nothing, nothing, 5e-4
+        mesh.vertices, 0.02 * up, *surface.lattices, centre, np.eye(3), ball.distance, 0.005, nothing, nothing, 5e-4
     )
     assert small == 1.0
+
+
+@pytest.mark.parametrize("move, spin, share", [
+    ([0.006, 0.0, 0.0], [0.0, 0.0, 0.0], 1.0),  # along the face
+    ([0.006, 0.0, 1e-4], [0.0, 0.0, 0.0], 1.0),  # and in by much less than the allowance
+    ([0.0, 0.0, 0.006], [0.0, 0.0, 0.0], 1 / 12),  # straight in
+    ([0.0, 0.0, -0.006], [0.0, 0.0, 0.0], 1.0),  # off
+    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.5], 1.0),  # spinning on the face
+])
+def test_a_body_that_slides_along_a_face_is_free_to(move, spin, share) -> None:
+    mesh = box_mesh((0.02, 0.02, 0.005), (3, 3, 1), "hex8")
+    brick = load_object({"shape": {"kind": "box", "size_mm": [6, 6, 5]}, "mass_g": 5})
+    scene = Scene()
+    scene.add_soft(mesh, RUBBER)
+    surface = contact_surface(scene.soft_bodies, spacing=0.4e-3)
+    centre = np.array([0.006, 0.01, 0.005 + 0.0025 - 1e-5])  # lies on the upper face, 10 um deep
+    limit = kernels.soft_step_limit(
+        mesh.vertices, np.zeros_like(mesh.vertices), *surface.lattices, centre, np.eye(3), brick.distance,
+        brick.bounding_radius, np.array([*move[:2], -move[2]]), np.array(spin), 5e-4,
+    )
+    assert share <= limit <= min(1.0, 1.5 * share)
+
+
+@pytest.mark.parametrize("thickness", [1.0, 2.0])
+def test_a_thin_wire_is_not_let_through_a_face(thickness) -> None:
+    mesh = box_mesh((0.02, 0.02, 0.005), (3, 3, 1), "hex8")
+    wire = load_object({"shape": {"kind": "box", "size_mm": [30, thickness, thickness]}, "mass_g": 1})
+    scene = Scene()
+    scene.add_soft(mesh, RUBBER)
+    surface = contact_surface(scene.soft_bodies, spacing=0.4e-3)
+    centre, fall = np.array([0.0101, 0.0093, 0.005 + 0.5e-3 * thickness + 1e-4]), np.array([0.0, 0.0, -0.004])
+    limit = kernels.soft_step_limit(
+        mesh.vertices, np.zeros_like(mesh.vertices), *surface.lattices, centre, np.eye(3), wire.distance,
+        wire.bounding_radius, fall, np.zeros(3), 5e-4,
+    )
+    assert 4.99e-4 <= 0.004 * limit <= 1e-4 + 1.5 * 5e-4  # the gap, the allowance, and what lies between two looks
 
 
 def test_values_are_found_again_by_their_keys() -> None:

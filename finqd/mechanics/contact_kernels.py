@@ -16,6 +16,9 @@ import numpy as np
 from numba import njit
 
 from finqd.mechanics.distance_kernels import distance_curvature, signed_distance
+from finqd.mechanics.rotation_kernels import rotation_matrix
+
+MARCH = 20.0  # allowances of a move after which points that slide along a body are not followed any farther
 
 
 @njit(cache=True)
@@ -196,12 +199,16 @@ def find_curvatures(field, rotation, rigid, row_rigid, turns, gap, normal, arm, 
 
 
 @njit(cache=True)
-def soft_step_limit(positions, direction, faces, centre, rotation, field, radius, shift, spin, allowance):
-    """Return the share of a move in which no point of a soft face can pass more than ``allowance`` [m] into a body.
+def soft_step_limit(
+    positions, direction, faces, face_lattice, lattice_first, lattice_weight, centre, rotation, field, radius, shift,
+    spin, allowance,
+):
+    """Return the share of a move in which no point of a soft face can go more than ``allowance`` [m] into a body.
 
     direction: of the soft vertices, shift and spin: of the body. The distance is 1-Lipschitz, and no point of a face
     moves farther against the body than its vertices do: the face's weights are shares. A face is safe while that stays
-    below the distance of its box from the body, plus the allowance.
+    below the distance of its box from the body, plus the allowance; the samples of one that is not are followed, since
+    most of them slide (`_way_inside`).
     """
     x, y, low, high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     limit = 1.0
@@ -224,14 +231,67 @@ def soft_step_limit(positions, direction, faces, centre, rotation, field, radius
             x[i] = 0.5 * (low[i] + high[i])
             size2 += (high[i] - low[i]) ** 2
             away2 += (x[i] - centre[i]) ** 2
-        free = max(math.sqrt(away2) - radius - 0.5 * math.sqrt(size2), 0.0) + allowance
+        half = 0.5 * math.sqrt(size2)
+        free = max(math.sqrt(away2) - radius - half, 0.0) + allowance
         if farthest * limit <= free:
             continue
         _into_body(x, centre, rotation, y)
         d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
-        free = max(d - 0.5 * math.sqrt(size2), 0.0) + allowance
+        free = max(d - half, 0.0) + allowance
         if farthest * limit > free:
-            limit = free / farthest
+            lattice = face_lattice[f]
+            weights = lattice_weight[lattice_first[lattice] : lattice_first[lattice + 1]]
+            limit = _way_inside(
+                positions, direction, faces[f], weights, centre, rotation, field, shift, spin, allowance,
+                free / farthest, min(limit, MARCH * allowance / farthest), 0.5 * allowance / farthest,
+            )
+    return limit
+
+
+@njit(cache=True)
+def _way_inside(
+    positions, direction, nodes, weights, centre, rotation, field, shift, spin, allowance, least, limit, stride
+):
+    """Return the share (``least`` to ``limit``) of a move up to which no sample of a face goes ``allowance`` [m] deep.
+
+    Counted is the way along the normal that a sample goes inside the body, inwards and outwards, so that nothing goes
+    right through a thin one either. ``stride``: share of the move between two looks.
+    """
+    x, y, u, way = np.empty(3), np.empty(3), np.empty(3), np.zeros(weights.shape[0])
+    c, w, last = np.empty(3), np.empty(3), np.empty(3)
+    share = 0.5 * stride
+    while share < limit:
+        turned = rotation_matrix(share * spin) @ rotation
+        for i in range(3):
+            c[i] = centre[i] + share * shift[i]
+        d = 0.0
+        for s in range(weights.shape[0]):
+            face_point(positions, nodes, weights[s], x)
+            face_point(direction, nodes, weights[s], u)
+            apart2 = 0.0
+            for i in range(3):
+                x[i] += share * u[i]
+                apart2 += (x[i] - last[i]) ** 2
+            if d > 0.0 and apart2 < d * d:  # the distance is 1-Lipschitz: outside as well
+                continue
+            for i in range(3):
+                last[i] = x[i]
+            _into_body(x, c, turned, y)
+            d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
+            if d >= 0.0:
+                continue
+            for i in range(3):
+                w[i] = x[i] - c[i]
+            u[0] -= shift[0] + spin[1] * w[2] - spin[2] * w[1]
+            u[1] -= shift[1] + spin[2] * w[0] - spin[0] * w[2]
+            u[2] -= shift[2] + spin[0] * w[1] - spin[1] * w[0]
+            rate = 0.0
+            for i in range(3):
+                rate += u[i] * (turned[i, 0] * n0 + turned[i, 1] * n1 + turned[i, 2] * n2)
+            way[s] += abs(rate) * stride
+            if way[s] > allowance:
+                return max(least, share - 0.5 * stride)
+        share += stride
     return limit
 
 

@@ -43,6 +43,11 @@ class ContactSurface:
             self.faces, self.face_area, self.face_lattice, self.lattice_first, self.lattice_weight, self.first_sample,
         )
 
+    @property
+    def lattices(self) -> tuple[np.ndarray, ...]:
+        """What kernels take that need no more than where samples are."""
+        return self.faces, self.face_lattice, self.lattice_first, self.lattice_weight
+
 
 def lattice(face_type: str, n: int, m: int) -> np.ndarray:
     """Return local points (p, 2) in the middles of n by m equal cells (n by n for a triangle).

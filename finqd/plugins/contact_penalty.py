@@ -221,7 +221,7 @@ class PenaltyContact:
             limit = min(
                 limit,
                 kernels.soft_step_limit(
-                    state.positions, direction.soft, self.surface.faces, *_pose(state, r), self.fields[r],
+                    state.positions, direction.soft, *self.surface.lattices, *_pose(state, r), self.fields[r],
                     float(body.shape.bounding_radius), direction.rigid[r, :3], direction.rigid[r, 3:], allowance,
                 ),
             )
