@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 HALVINGS = 8  # a step is halved at most this often before the simulation ends as diverged
 CALM_STEPS = 2  # steps that must succeed before a halved step is doubled again
+EASY = 10  # Newton iterations of such a step; one that takes more would hardly succeed at twice the length,
+HARD_STEP = 0.25  # and counts for this much
 
 
 @dataclass(kw_only=True)
@@ -51,7 +53,7 @@ class _Recorder:
         counted = {
             "steps": int(report.converged), "rejected_steps": int(not report.converged),
             "newton_iterations": report.iterations, "quasi_iterations": report.quasi_iterations,
-            "line_search_steps": report.line_searches,
+            "rigid_iterations": report.rigid_iterations, "line_search_steps": report.line_searches,
             "factorisations": report.factorisations, "cg_iterations": report.cg_iterations,
             "projections": report.projections, "friction_updates": report.friction_updates,
             "error_rejections": report.error_rejections, "error_overruns": report.error_overruns,
@@ -80,7 +82,7 @@ class _StepControl:
 
     frame: float
     halvings: int = 0
-    calm: int = 0
+    calm: float = 0.0
     proposed: float | None = None
 
     @property
@@ -101,13 +103,13 @@ class _StepControl:
                 return False
             self.proposed = min(max(report.next_dt, self.shortest), self.frame)
         elif report.converged:
-            self.calm += 1
+            self.calm += 1.0 if report.iterations <= EASY else HARD_STEP
             if self.calm >= CALM_STEPS and self.halvings:
-                self.halvings, self.calm = self.halvings - 1, 0
+                self.halvings, self.calm = self.halvings - 1, 0.0
         elif self.halvings == HALVINGS:
             return False
         else:
-            self.halvings, self.calm = self.halvings + 1, 0
+            self.halvings, self.calm = self.halvings + 1, 0.0
         return True
 
 

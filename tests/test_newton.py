@@ -19,6 +19,9 @@ HEAVY, LIGHT = 5.0, 0.5 * newton.LAG_FORCE  # [N] contact force
 class Scripted(Newton):
     """Newton's method on a problem that one iteration solves, until the next renewal leaves what a script says."""
 
+    def _relax(self, trial: Any, energy: float, renewals: Any) -> None:
+        """Nothing rigid plays a part."""
+
     def _iterate(self, trial: Any, energy: float) -> Any:
         self.system.left = 0.0
         return trial, energy

@@ -212,12 +212,25 @@ class Increment:
         add_diagonal(system.pattern.indptr, self.masses / h**2, d.blocks)
         if self.damping is not None:
             self.damping.add_hessian(state.positions, d.blocks, projected=projected)
+        self._add_rigid_inertia(state)
+        system.hold_fixed()
+
+    def rigid_hessian(self, state: State) -> None:
+        """Fill the rigid bodies' part of the Hessian alone, and what couples them to soft vertices; spoil the rest."""
+        system, d = self.system, self.system.derivatives
+        d.coupling[:] = 0.0
+        d.rigid_matrix[:] = 0.0
+        system.contact.add_hessian(state, d)
+        self._add_rigid_inertia(state)
+        system.hold_rigid()
+
+    def _add_rigid_inertia(self, state: State) -> None:
+        matrix, h = self.system.derivatives.rigid_matrix, self.past.h
         for b, turn in enumerate(self._turns(state)):
             jacobian = inverse_left_jacobian(turn)
             body = slice(6 * b, 6 * b + 6)
-            d.rigid_matrix[body, body][:3, :3] += np.eye(3) * system.rigid_masses[b] / h**2
-            d.rigid_matrix[body, body][3:, 3:] += jacobian.T @ self.past.inertias[b] @ jacobian / h**2
-        system.hold_fixed()
+            matrix[body, body][:3, :3] += np.eye(3) * self.system.rigid_masses[b] / h**2
+            matrix[body, body][3:, 3:] += jacobian.T @ self.past.inertias[b] @ jacobian / h**2
 
     def finished(self, trial: State) -> State:
         """Return ``trial`` as the end of the step, with its velocities and the start as its ``previous``."""

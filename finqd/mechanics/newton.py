@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from finqd.mechanics.incremental import Increment
 from finqd.mechanics.linear import LinearSolution, LinearSolver, make_solver
 from finqd.mechanics.quasi_newton import QuasiNewton, as_direction, as_vector
+from finqd.mechanics.rigid_relaxation import rigid_move, untouched
 from finqd.mechanics.state import Direction, State, StepReport
 from finqd.mechanics.system import System
 
@@ -22,6 +23,7 @@ LAG_CHANGE = 0.5  # share of the friction bounds, in sum, that may miss Coulomb'
 PATIENCE = 2  # times as many renewals are granted before what they leave makes the step fail
 EARLY = 0.05  # [N] residual at which friction bounds are renewed for the first time, before the minimum is found
 INNER = 0.1  # share of what a renewal unbalanced that Newton leaves before the next one: it will unbalance more
+RELAXATIONS = 60  # iterations of rigid bodies alone in a step, and as many more for each renewal
 FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 HALVINGS = 31  # of the Newton step, before the line search gives up
 ENOUGH = 12  # halvings after which it is content with the lowest energy so far
@@ -74,10 +76,12 @@ class _Renewals:
 
     early: whether one is due before the minimum; added: what the last one unbalanced [N]
     best: minimum that a renewal disturbed least, best_jump: by how much [N]
+    idle: whether there has been no rigid body to relax since the last one
     """
 
     early: bool = True
     added: float = 0.0
+    idle: bool = False
     best: State | None = None
     best_jump: float = np.inf
 
@@ -115,7 +119,7 @@ class Newton:
                 left = f"{report.residual:.3g} N left on {report.where}"
                 report.reason = f"no equilibrium after {report.iterations} iterations: {left}"
                 break
-            moved = self._step(trial, energy, quasi)
+            moved = self._relax(trial, energy, renewals) or self._step(trial, energy, quasi)
             if moved is None:
                 if renewals.best is None and report.residual <= options.tolerance_N:  # at rest, to the last digit
                     renewals.best, renewals.best_jump, report.reason = trial, report.residual, ""
@@ -138,7 +142,7 @@ class Newton:
     def _renew(self, trial: State, renewals: _Renewals, *, done: bool) -> tuple[float, bool]:
         """Renew what contact lags at ``trial``, a minimum if ``done``; return its energy, and whether the step ends."""
         report, options, contact = self.report, self.options, self.system.contact
-        renewals.early = False
+        renewals.early = renewals.idle = False
         change, before = contact.relag(trial), report.residual
         report.friction_updates += 1
         energy = self.increment.gradient(trial)
@@ -169,6 +173,32 @@ class Newton:
     def _bound(self) -> float:
         """Return what renewed contact may leave unbalanced at the end of a step [N]."""
         return max(LAG_FORCE, LAG_SHARE * float(np.max(self.system.contact.relagged_forces, initial=0.0)))
+
+    def _relax(self, trial: State, energy: float, renewals: _Renewals) -> tuple[State, float] | None:
+        """Bring rigid bodies that touch nothing soft to rest while all else stays; None if that leads nowhere."""
+        report, system, least = self.report, self.system, self.options.tolerance_N
+        origin, found, before, free = trial, None, None, None
+        while not renewals.idle and report.rigid_iterations < RELAXATIONS * (1 + report.friction_updates):
+            if system.rigid_residual() <= least:
+                break
+            now = untouched(self.increment, trial)
+            if free is not None and np.any(free & ~now):  # where it meets something soft, all have a say
+                found = before
+                self.increment.gradient(origin if found is None else found[0])
+                break
+            before, free = found, now
+            move = rigid_move(system, free, least=least)
+            if move is None:
+                break
+            report.rigid_iterations += 1
+            direction = Direction(soft=np.zeros_like(trial.positions), rigid=move)
+            moved = self._search(trial, energy, direction, self._slope(direction))
+            if moved is None:
+                self.increment.gradient(trial)
+                break
+            found = trial, energy = moved
+        renewals.idle = found is None
+        return found
 
     def _step(self, trial: State, energy: float, quasi: QuasiNewton) -> tuple[State, float] | None:
         """Do one iteration, of the cheap kind while those get on; return as `_iterate` does."""

@@ -44,7 +44,10 @@ class State:
     previous: State | None = None
 
     def moved(self, direction: Direction, share: float = 1.0) -> State:
-        """Return the state with positions and rotations moved by ``share`` of ``direction``."""
+        """Return the state with positions and rotations moved by ``share`` of ``direction``.
+
+        Where nothing soft moves, the array of its positions stays the same one: what is known of it is found again.
+        """
         rotations = self.rigid_rotations
         if len(rotations):
             rotations = np.stack(
@@ -52,7 +55,7 @@ class State:
             )
         return replace(
             self,
-            positions=self.positions + share * direction.soft,
+            positions=self.positions + share * direction.soft if direction.soft.any() else self.positions,
             rigid_positions=self.rigid_positions + share * direction.rigid[:, :3],
             rigid_rotations=rotations,
         )
@@ -62,6 +65,7 @@ class State:
 class StepReport:
     """What one attempt at a step did.
 
+    rigid_iterations: of rigid bodies alone, which need no matrix of soft ones
     residual: largest force that is left unbalanced [N]; where: what it acts on
     residuals: the history over the iterations [N]
     error: estimate of the step's own error [m], NaN where the stepper makes none
@@ -74,6 +78,7 @@ class StepReport:
     reason: str = ""
     iterations: int = 0
     quasi_iterations: int = 0
+    rigid_iterations: int = 0
     line_searches: int = 0
     factorisations: int = 0
     cg_iterations: int = 0
@@ -91,8 +96,8 @@ class StepReport:
     def add_work(self, other: StepReport) -> None:
         """Add what another attempt at the same step cost."""
         counted = (
-            "iterations", "quasi_iterations", "line_searches", "factorisations", "cg_iterations", "projections",
-            "friction_updates",
+            "iterations", "quasi_iterations", "rigid_iterations", "line_searches", "factorisations", "cg_iterations",
+            "projections", "friction_updates",
         )
         for name in counted:
             setattr(self, name, getattr(self, name) + getattr(other, name))

@@ -180,6 +180,11 @@ class System:
         """Make held degrees of freedom drop out of the Hessian."""
         d = self.derivatives
         hold(self.pattern.indptr, self.pattern.indices, self.fixed, d.blocks, d.coupling)
+        self.hold_rigid()
+
+    def hold_rigid(self) -> None:
+        """Make held rigid bodies drop out of the Hessian."""
+        d = self.derivatives
         for b in np.flatnonzero(self.rigid_held):
             body = slice(6 * b, 6 * b + 6)
             d.coupling[:, body] = 0.0
@@ -205,11 +210,18 @@ class System:
         d = self.derivatives
         best, vertex = largest_force(d.soft, self.fixed)
         where = self._vertex_name(vertex) if vertex >= 0 else ""
-        for i, row in enumerate(d.rigid if np.isfinite(best) else ()):
-            force = max(np.linalg.norm(row[:3]), np.linalg.norm(row[3:]) / self.rigid_sizes[i])
+        for i, force in enumerate(self._rigid_forces() if np.isfinite(best) else ()):
             if not force <= best:
                 best, where = float(force), self.scene.rigid_bodies[i].name
         return float(best), where
+
+    def rigid_residual(self) -> float:
+        """Return the largest unbalanced force on a rigid body [N], as `residual` counts torques."""
+        return float(np.max(self._rigid_forces(), initial=0.0))
+
+    def _rigid_forces(self) -> np.ndarray:
+        forces, torques = np.linalg.norm(self.derivatives.rigid.reshape(-1, 2, 3), axis=2).T
+        return np.maximum(forces, torques / self.rigid_sizes)
 
     def _vertex_name(self, vertex: int) -> str:
         for body in self.scene.soft_bodies:
