@@ -318,7 +318,7 @@ def test_settings_are_parsed_as_json_or_text():
 
 def test_presets_set_what_is_open_and_nothing_else(benchmark):
     fine = apply_preset(benchmark, "fine")
-    assert (fine.plugin("mesher").size_mm, fine.protocol.time_step_ms) == (2.0, 5.0)
+    assert (fine.plugin("mesher").size_mm, fine.protocol.time_step_ms) == (2.0, 10.0)
     own = {"size_mm": 3, "layers": 4, "order": 1, "notch_nodes": "middle"}
     stepper = {"name": "implicit_euler", "tolerance_N": 1e-4}
     explicit = benchmark.with_overrides(
