@@ -1,6 +1,9 @@
 """Do verdicts depend on the preset? Grasps with one preset against the same grasps with better ones, and the paper's.
 
-    python benchmarks/verdict_flips.py --log flips.jsonl [--budget-minutes 120] [--suites fine,reference,paper]
+    python benchmarks/verdict_flips.py --log benchmarks/verdict_flips.jsonl --suites fine,reference [--report]
+    python benchmarks/verdict_flips.py --log paper.jsonl --suites paper --limit-s 7200
+
+The first log is the study as far as it has got; the command goes on with it, and with ``--report`` only prints it.
 
 Three suites of pairs, chosen before any of them was looked at (`SEED`):
 
@@ -286,7 +289,7 @@ def main() -> None:
     parser.add_argument("--suites", default=",".join(SUITES), help="some of fine, reference, paper")
     parser.add_argument("--pairs", type=int, help="only that many, from the beginning of the interleaved order")
     parser.add_argument("--budget-minutes", type=float, default=math.inf, help="no grasp starts later")
-    parser.add_argument("--limit-s", type=float, default=7200.0, help="a simulation is given up after that")
+    parser.add_argument("--limit-s", type=float, default=1800.0, help="a simulation is given up after that")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--report", action="store_true", help="only print what the log holds")
     parser.add_argument("--bands", action="store_true", help="write the preset's errors into studies/presets.json")
