@@ -228,6 +228,21 @@ def test_a_body_that_slides_along_a_face_is_free_to(move, spin, share) -> None:
     assert share <= limit <= min(1.0, 1.5 * share)
 
 
+def test_a_body_far_away_may_come_as_near_as_it_is() -> None:
+    mesh = box_mesh((0.02, 0.02, 0.005), (3, 3, 1), "hex8")
+    brick = load_object({"shape": {"kind": "box", "size_mm": [6, 6, 5]}, "mass_g": 5})
+    scene = Scene()
+    scene.add_soft(mesh, RUBBER)
+    surface = contact_surface(scene.soft_bodies, spacing=0.4e-3)
+    gap, fall = 0.05, 0.2
+    centre = np.array([0.01, 0.01, 0.005 + 0.0025 + gap])
+    limit = kernels.soft_step_limit(
+        mesh.vertices, np.zeros_like(mesh.vertices), *surface.lattices, centre, np.eye(3), brick.distance,
+        brick.bounding_radius, np.array([0.0, 0.0, -fall]), np.zeros(3), 5e-4,
+    )
+    assert 0.9 * gap <= fall * limit <= gap + 1.5 * 5e-4
+
+
 @pytest.mark.parametrize("thickness", [1.0, 2.0])
 def test_a_thin_wire_is_not_let_through_a_face(thickness) -> None:
     mesh = box_mesh((0.02, 0.02, 0.005), (3, 3, 1), "hex8")

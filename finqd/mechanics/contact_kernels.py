@@ -243,23 +243,25 @@ def soft_step_limit(
             weights = lattice_weight[lattice_first[lattice] : lattice_first[lattice + 1]]
             limit = _way_inside(
                 positions, direction, faces[f], weights, centre, rotation, field, shift, spin, allowance,
-                free / farthest, min(limit, MARCH * allowance / farthest), 0.5 * allowance / farthest,
+                (free - allowance) / farthest, limit, allowance / farthest,
             )
     return limit
 
 
 @njit(cache=True)
 def _way_inside(
-    positions, direction, nodes, weights, centre, rotation, field, shift, spin, allowance, least, limit, stride
+    positions, direction, nodes, weights, centre, rotation, field, shift, spin, allowance, begin, limit, unit
 ):
-    """Return the share (``least`` to ``limit``) of a move up to which no sample of a face goes ``allowance`` [m] deep.
+    """Return the share (up to ``limit``) of a move up to which no sample of a face goes ``allowance`` [m] deep.
 
     Counted is the way along the normal that a sample goes inside the body, inwards and outwards, so that nothing goes
-    right through a thin one either. ``stride``: share of the move between two looks.
+    right through a thin one either. begin: share up to which the face touches nothing; unit: share in which it moves
+    by the allowance. At least one unit is granted, at most `MARCH` of them; there are two looks in each.
     """
+    stride, least, limit = 0.5 * unit, begin + unit, min(limit, begin + MARCH * unit)
     x, y, u, way = np.empty(3), np.empty(3), np.empty(3), np.zeros(weights.shape[0])
     c, w, last = np.empty(3), np.empty(3), np.empty(3)
-    share = 0.5 * stride
+    share = begin + 0.5 * stride
     while share < limit:
         turned = rotation_matrix(share * spin) @ rotation
         for i in range(3):

@@ -25,6 +25,8 @@ def untouched(increment: Increment, state: State) -> np.ndarray:
 def rigid_move(system: System, free: np.ndarray, *, least: float) -> np.ndarray | None:
     """Return a move (n_rigid, 6) of the bodies that are ``free``, downhill; None if they all are at rest.
 
+    None as well where a curvature is not finite: the step then fails as data.
+
     Taken from gradient and rigid Hessian in the system's derivatives; least: force at which a body counts as at rest
     [N]. Curvatures are taken without their sign, so that the move leads down from saddles too: Nocedal and Wright,
     Numerical Optimization (2006), section 3.4.
@@ -33,6 +35,8 @@ def rigid_move(system: System, free: np.ndarray, *, least: float) -> np.ndarray 
     force = np.where(free[:, None], d.rigid, 0.0)
     lengths = np.where(np.arange(6) < 3, 1.0, 1.0 / system.rigid_sizes[:, None])
     if np.linalg.norm((lengths * force).reshape(-1, 3), axis=1).max(initial=0.0) <= least:
+        return None
+    if not np.all(np.isfinite(d.rigid_matrix)):
         return None
     scale = lengths.reshape(-1)
     values, vectors = np.linalg.eigh(scale[:, None] * d.rigid_matrix * scale)
