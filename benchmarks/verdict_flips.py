@@ -12,10 +12,10 @@ Three suites of pairs, chosen before any of them was looked at (`SEED`):
 - paper: the benchmark design x 10 objects, `standard` against `paper`.
 
 The pairs of every suite are shuffled and the suites interleaved, so that whatever part of the study is done is an
-unbiased sample of the whole. Error estimates are made for every fifth grasp, and for those whose verdict flips: whether
-they flag flips is the question, and how often they flag others is answered by the sample. Writes a line a grasp as it
-goes, and resumes from there; a line whose design or preset has changed since is not used. Prints flips, whether the
-estimate had flagged each, errors of force and drop, and what the better one costs.
+unbiased sample of the whole. Error estimates follow, first for grasps whose verdict flips, then for every fifth:
+whether they flag flips is the question, and how often they flag others is answered by the sample. Writes a line a grasp
+as it goes, and resumes from there; a line whose design or preset has changed since is not used. Prints flips, whether
+the estimate had flagged each, errors of force and drop, and what the better one costs.
 """
 
 from __future__ import annotations
@@ -142,21 +142,23 @@ def run(arguments: argparse.Namespace, wanted: list[Pair]) -> dict[Grasp, dict[s
         log.write_text(log.read_text() + "\n")  # the line that a kill cut short must not swallow the next
     deadline = time.time() + 60.0 * arguments.budget_minutes
     todo = dict.fromkeys(grasp for pair in wanted for grasp in (pair.ours, pair.other))
-    sample = {pair.ours for pair in [pair for pair in wanted if pair.suite != "paper"][::ESTIMATED]}
-    simulate_missing(arguments, rows, list(todo), sample, deadline)
+    simulate_missing(arguments, known, rows, list(todo), set(), deadline)
     flipped = {pair.ours for pair in wanted if {pair.ours, pair.other} <= rows.keys()
+               and rows[pair.ours]["status"] == rows[pair.other]["status"] == "ok"
                and rows[pair.ours]["held"] != rows[pair.other]["held"] and pair.suite != "paper"}
-    simulate_missing(arguments, rows, list(flipped), flipped, deadline)
+    simulate_missing(arguments, known, rows, list(flipped), flipped, deadline)
+    sample = {pair.ours for pair in [pair for pair in wanted if pair.suite != "paper"][::ESTIMATED]}
+    simulate_missing(arguments, known, rows, list(sample), sample, deadline)
     return rows
 
 
 def simulate_missing(
-    arguments: argparse.Namespace, rows: dict[Grasp, dict[str, Any]], todo: list[Grasp], estimated: set[Grasp],
-    deadline: float,
+    arguments: argparse.Namespace, known: dict[str, Design], rows: dict[Grasp, dict[str, Any]], todo: list[Grasp],
+    estimated: set[Grasp], deadline: float,
 ) -> None:
     """Simulate those of ``todo`` that have no row yet, or no estimate though they are to have one; log, add to rows."""
-    log, known = Path(arguments.log), designs()
-    grasps = [g for g in todo if g not in rows or (g in estimated and rows[g]["estimate"] is None)]
+    log = Path(arguments.log)
+    grasps = [g for g in todo if g not in rows or (g in estimated and not has_estimate(rows[g]))]
     tasks = [(g, prepared(g, known[g.design], arguments.limit_s), g in estimated, deadline) for g in grasps]
 
     def on_result(index: int, row: Any) -> None:
@@ -171,6 +173,11 @@ def simulate_missing(
     run_tasks(simulate, tasks, jobs=arguments.jobs, on_result=on_result)
 
 
+def has_estimate(row: dict[str, Any]) -> bool:
+    """Tell whether a row has an error estimate; one of three levels, as they once were fewer."""
+    return row["estimate"] is not None and len(row["estimate_levels"]["levels"]) == 3
+
+
 def words(row: dict[str, Any]) -> str:
     """Return one grasp in words."""
     verdict = row["status"] if row["status"] != "ok" else "held" if row["held"] else "lost"
@@ -181,20 +188,34 @@ def words(row: dict[str, Any]) -> str:
 
 
 def done(wanted: list[Pair], suite: str, rows: dict[Grasp, Any]) -> Iterator[tuple[Pair, dict, dict]]:
-    """Yield the pairs of a suite of which both grasps are there."""
+    """Yield the pairs of a suite of which both grasps are there and came to a verdict."""
     for pair in wanted:
-        if pair.suite == suite and pair.ours in rows and pair.other in rows:
-            yield pair, rows[pair.ours], rows[pair.other]
+        both = [rows[grasp] for grasp in (pair.ours, pair.other) if grasp in rows]
+        if pair.suite == suite and [row["status"] for row in both] == ["ok", "ok"]:
+            yield pair, both[0], both[1]
+
+
+def without_verdict(wanted: list[Pair], suite: str, rows: dict[Grasp, Any]) -> Iterator[str]:
+    """Yield in words the grasps of a suite that came to no verdict."""
+    for grasp in dict.fromkeys(g for pair in wanted if pair.suite == suite for g in (pair.ours, pair.other)):
+        if grasp in rows and rows[grasp]["status"] != "ok":
+            yield f"{grasp.design}, {grasp.grasped}, {grasp.preset}: {words(rows[grasp])} {rows[grasp]['reason']}"
 
 
 def report(wanted: list[Pair], rows: dict[Grasp, dict[str, Any]]) -> None:
     """Print each suite: flips, flags, errors, seconds."""
     for suite in SUITES:
+        for failure in without_verdict(wanted, suite, rows):
+            print(f"no verdict: {failure}")
         found = list(done(wanted, suite, rows))
         if not found:
             continue
         total = sum(pair.suite == suite for pair in wanted)
-        print(f"\n{found[0][0].ours.preset} against {suite}: {len(found)} of {total} pairs")
+        codes = {row["versions"].get("source") or row.get("code") for _, *both in found for row in both}
+        named = len(codes - {None})
+        mixed = f"; made with {named} states of the source and older ones" if None in codes else (
+            f"; made with {named} states of the source" if named > 1 else "")
+        print(f"\n{found[0][0].ours.preset} against {suite}: {len(found)} of {total} pairs{mixed}")
         report_flips(found)
         report_errors(found)
         if suite == "paper":
@@ -210,18 +231,15 @@ def report_flips(found: list[tuple[Pair, dict, dict]]) -> None:
     print(f"  verdict flips: {len(flips)}, {share:.1f} % (95 % interval {low:.1f} to {high:.1f})")
     for pair, ours, other in flips:
         print(f"    {pair.ours.design}, {pair.ours.grasped}: {words(ours)}   {pair.other.preset}: {words(other)}")
-        if ours["estimate"]:
+        if has_estimate(ours):
             print(f"      flagged: {ours['estimate']['reason'] or 'NOT FLAGGED'}")
         elif pair.suite != "paper":
             print("      not estimated yet")
-    estimated = [(ours, other) for _, ours, other in found if ours["estimate"]]
+    estimated = [(ours, other) for _, ours, other in found if has_estimate(ours)]
     if estimated:
         flagged = sum(ours["estimate"]["uncertain"] for ours, _ in estimated)
         missed = sum(ours["held"] != other["held"] and not ours["estimate"]["uncertain"] for ours, other in estimated)
         print(f"  flagged uncertain: {flagged} of {len(estimated)}; flips that were not flagged: {missed}")
-    failed = [(pair, row) for pair, *both in found for row in both if row["status"] not in ("ok", "no_room")]
-    for pair, row in failed:
-        print(f"  failed: {pair.ours.design}, {pair.ours.grasped}, {row['preset']}: {row['status']}: {row['reason']}")
 
 
 def held_by_both(found: list[tuple[Pair, dict, dict]]) -> list[tuple[str, str, list[tuple[float, dict, dict]]]]:
@@ -240,7 +258,7 @@ def report_errors(found: list[tuple[Pair, dict, dict]]) -> None:
         values = np.array([error for error, _, _ in errors])
         line = f"  {name} of {len(values)} held by both: median {np.median(values):.2f}, " \
                f"{QUANTILE} % below {np.percentile(values, QUANTILE):.2f}, largest {values.max():.2f}"
-        spreads = [(abs(a[entry] - b[entry]), a["estimate"][entry][1]) for _, a, b in errors if a["estimate"]]
+        spreads = [(abs(a[entry] - b[entry]), a["estimate"][entry][1]) for _, a, b in errors if has_estimate(a)]
         known = [(error, spread) for error, spread in spreads if spread is not None]
         if known:
             inside = sum(error <= spread for error, spread in known)
@@ -251,7 +269,7 @@ def report_errors(found: list[tuple[Pair, dict, dict]]) -> None:
     ratios = other / np.maximum(ours, 1e-9)
     print(f"  seconds a grasp: {ours.mean():.1f} and {other.mean():.1f}; "
           f"ratio of the sums {other.sum() / ours.sum():.2f}, median ratio {np.median(ratios):.2f}")
-    costs = [row["estimate_levels"]["seconds"] for _, row, _ in found if row["estimate_levels"]]
+    costs = [row["estimate_levels"]["seconds"] for _, row, _ in found if has_estimate(row)]
     if costs:
         base = sum(cost["base"] for cost in costs)
         extra = sum(value for cost in costs for name, value in cost.items() if name != "base")
@@ -304,7 +322,8 @@ def main() -> None:
     report(wanted, rows)
     if arguments.bands:
         found = list(done(wanted, "fine", rows))
-        if len(found) < sum(pair.suite == "fine" for pair in wanted) or arguments.pairs:
+        made = [pair for pair in wanted if pair.suite == "fine" and {pair.ours, pair.other} <= rows.keys()]
+        if len(made) < sum(pair.suite == "fine" for pair in wanted) or arguments.pairs:
             parser.exit(1, "the suite fine is not complete: no bands from this\n")
         write_bands(arguments.preset, found)
 

@@ -24,6 +24,7 @@ from finqd.accuracy_ladder import Rung, build_ladder, options_text, reference_ru
 from finqd.accuracy_log import append_row, read_rows
 from finqd.accuracy_machine import describe_machine
 from finqd.accuracy_reference import Reference, error_of, make_reference, shipped_reference
+from finqd.errors import InputError
 from finqd.presets import DEFAULT, PRESETS
 from finqd.workers import TaskFailure, run_tasks
 
@@ -35,6 +36,7 @@ DEAR_S, DEAR_TIMES = 40.0, 4.0  # rungs expected to take longer, and that many t
 PRESET_TIMES = 5.0  # the presets only if they are expected to take that many times longer still
 REFERENCE_LIMITS = 6.0  # a rung of the reference may take that many times the limit of another
 UNDISTURBED = 0.6  # share of its time that a rung has the processor, meshing in another process set aside
+REFINING = ("size", "element", "step", "stepper", "adaptive", "newton")  # knobs whose series refine one number
 MARGIN = 1.5  # for a budget, rungs expected to take up to this many times as long are tried
 
 #: what a row must hold; one that another version of finqd logged without it is run again
@@ -67,7 +69,8 @@ def measure_rung(task: RungTask, *, progress: Callable[[float], None] | None = N
 class Study:
     """A ladder on one design and case, and what is known of it so far.
 
-    rungs: those to be run, by expected cost; omitted: name -> why a rung is not run (dear, or not installed)
+    rungs: those to be run, by expected cost; omitted: name -> why a rung is not run (dear, not installed, or another
+        of its series that was to cost less ran out of time)
     rows: one mapping a measured rung, as in the log, without its error (see `table`)
     """
 
@@ -80,6 +83,7 @@ class Study:
     limit: float = 600.0
     jobs: int = 1
     full: bool = False
+    swept: bool = True  # whether the reference's meshes are; tetrahedra where the shape is none that can be
     reference: Reference | None = None
     rows: list[Row] = field(default_factory=list)
     on_row: Callable[[Row], None] | None = None
@@ -98,9 +102,24 @@ class Study:
         for rung in rungs:
             if self.row_of(rung, limit=limit) is None:
                 waiting.setdefault(self.key(rung), rung)
-        todo = list(waiting.values())
-        for start in range(0, len(todo), self.jobs):
-            self._run_side_by_side(todo[start : start + self.jobs], limit)
+        todo = [rung for rung in waiting.values() if not self._hopeless(rung, limit)]
+        while todo:
+            self._run_side_by_side(todo[: self.jobs], limit)
+            todo = [rung for rung in todo[self.jobs :] if not self._hopeless(rung, limit)]
+
+    def _hopeless(self, rung: Rung, limit: float) -> bool:
+        """Tell whether a rung of the same series that was to cost less ran out of as much time, and note it."""
+        presets = {self.key(known) for known in self.rungs if known.knob == "preset"}
+        if rung.knob not in REFINING or self.key(rung) in presets:
+            return False
+        for known in self.rungs:
+            cheaper = known.series == rung.series and self.costs[known.name] < self.costs[rung.name]
+            row = self.row_of(known) if cheaper else None
+            if row is not None and row["status"] == "timeout" and row["limit_s"] >= limit:
+                reason = f"{known.name}, which is to cost less, took over {row['limit_s']:g} s"
+                self.omitted = {**self.omitted, rung.name: reason}
+                return True
+        return False
 
     def _run_side_by_side(self, rungs: Sequence[Rung], limit: float) -> None:
         tasks = [
@@ -140,10 +159,10 @@ class Study:
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """Versions on which results depend."""
+        """Versions on which results depend, and the digest of finqd's source."""
         from finqd.evaluate import versions
 
-        return versions()
+        return dict(versions())
 
     @cached_property
     def machine(self) -> dict[str, Any]:
@@ -157,9 +176,10 @@ class Study:
         return self.designs[rung.name]
 
     def key(self, rung: Rung) -> str:
-        """Return a hash of all that a rung's value depends on, versions included."""
+        """Return a hash of all that a rung's value depends on, versions included; for the source see `outdated`."""
         if rung.name not in self.keys:
-            parts = [self.case.name, self.applied(rung).digest(), fingerprint(self.options), self.versions]
+            released = {name: one for name, one in self.versions.items() if name != "source"}
+            parts = [self.case.name, self.applied(rung).digest(), fingerprint(self.options), released]
             self.keys[rung.name] = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
         return self.keys[rung.name]
 
@@ -168,6 +188,8 @@ class Study:
         """A hash of all that the exact values depend on: nothing of how they are computed."""
         resolved = self.design.with_overrides(self.case.overrides).resolved()
         known: dict[str, Any] = {key: resolved.get(key) for key in self.case.physics}
+        if resolved["elasticity"]["name"] != "corotated":  # the law is physics; the usual one was once left out here
+            known["elasticity"] = resolved["elasticity"]
         # a constant of zero is left out: what a later version adds to the material, and is off, changes no value
         known["material"] = {key: value for key, value in known["material"].items() if value != 0}
         if "protocol" in known:
@@ -222,7 +244,7 @@ class Study:
     def reference_rungs(self) -> tuple[Rung, ...]:
         """The rungs of which this study makes its reference, if it does."""
         return () if self.reference is not None and self.reference.source != "computed" else reference_rungs(
-            self.case.name, full=self.full
+            self.case.name, full=self.full, swept=self.swept
         )
 
     def _standard(self) -> float | None:
@@ -248,15 +270,29 @@ class Study:
         return (ratios[len(ratios) // 2] if ratios else 1.0) * self.costs[rung.name]
 
     def set_reference(self, wanted: str | Reference) -> None:
-        """Take the reference that ships with finqd ("auto", if there is one), or make it ("compute")."""
+        """Take the reference that ships with finqd ("auto", if there is one), or make it ("compute").
+
+        Raises ``InputError`` for a reference of another case, shape, material or object: its values are no errors.
+        """
         found = shipped_reference(self.case.name, self.physics) if wanted == "auto" else None
         if isinstance(wanted, Reference):
             found = wanted
+            same = (found.case, found.physics, found.quantity) == (self.case.name, self.physics, self.case.main)
+            if not same:
+                what = f"{found.case} of {found.design or 'another design'}"
+                raise InputError(f"is of another case or another physics: {what}", f"--reference {found.source}")
         if found is None:
-            pair = reference_rungs(self.case.name, full=self.full)
-            self.run(pair, limit=REFERENCE_LIMITS * self.limit)
-            found = make_reference(self.case, self.physics, [self.row_of(rung) for rung in pair], full=self.full)
+            rows = self._families()
+            if all(row is not None and row["status"] == "mesh_failed" for row in rows):
+                self.swept = False  # what cannot be swept can still be filled with tetrahedra
+                rows = self._families()
+            found = make_reference(self.case, self.physics, rows, full=self.full, one_family=not self.swept)
         self.reference = found
+
+    def _families(self) -> list[Row | None]:
+        rungs = reference_rungs(self.case.name, full=self.full, swept=self.swept)
+        self.run(rungs, limit=REFERENCE_LIMITS * self.limit)
+        return [self.row_of(rung) for rung in rungs]
 
 
 def open_study(
@@ -340,6 +376,11 @@ def disturbed(rows: Sequence[Row]) -> list[str]:
         if row["status"] == "ok" and row["seconds"] > 1.0 and row.get("cpu_seconds") is not None
         and row["cpu_seconds"] < UNDISTURBED * row["wall_seconds"]
     ]
+
+
+def outdated(rows: Sequence[Row], source: str) -> list[str]:
+    """Return the rungs that were measured with another state of finqd's source under the same version."""
+    return [row["rung"] for row in rows if row["versions"].get("source") != source]
 
 
 def fingerprint(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 #: what is measured of a preset; the study that each comes from
 MEASURED = {
-    "press_force_error_percent": "press", "press_seconds": "press", "grasp_force_error_percent": "grasp",
-    "drop_error_mm": "grasp", "verdict_flips_percent": "grasp", "grasp_seconds": "grasp",
+    "press_force_error_percent": "press", "press_seconds": "press", "press_fingers_error_percent": "press_fingers",
+    "grasp_force_error_percent": "grasp", "drop_error_mm": "grasp", "verdict_flips_percent": "grasp",
+    "grasp_seconds": "grasp",
 }  # fmt: skip
 NOT_MEASURED = "not measured yet"
 
@@ -92,8 +93,9 @@ def _summary(numbers: Mapping[str, Any]) -> str:
         text.format(numbers[key])
         for key, text in (
             ("press_force_error_percent", "force of a press {:.2g} % off"),
-            ("grasp_force_error_percent", "force in a grasp {:.2g} % off"),
-            ("drop_error_mm", "drop {:.2g} mm off"),
+            ("press_fingers_error_percent", "on 9 of 10 fingers within {:.2g} %"),
+            ("grasp_force_error_percent", "force of 9 of 10 grasps within {:.2g} %"),
+            ("drop_error_mm", "drop within {:.2g} mm"),
             ("verdict_flips_percent", "{:.2g} % of verdicts flip"),
         )
         if numbers[key] is not None

@@ -21,11 +21,14 @@ if TYPE_CHECKING:
 KNOBS = {
     "size": "mesh size of the default element", "element": "element families, each over its mesh sizes",
     "step": "time step", "stepper": "time integration", "adaptive": "time step from an error estimate",
-    "newton": "tolerance of Newton's method", "linear": "linear solver", "contact": "contact model",
+    "newton": "tolerances of Newton's method", "linear": "linear solver", "contact": "contact model",
     "elasticity": "constitutive law", "preset": "the named presets",
 }
-#: sections of a design that say how it is computed rather than what it is
-NUMERICS = ("mesher", "elasticity", "stepper", "contact")
+#: knobs that trade error against seconds, by which a question is answered; the others hardly do
+TRADES = ("preset", "size", "element", "step", "adaptive")
+#: sections of a design that say how it is computed rather than what it is; the elasticity says both
+NUMERICS = ("mesher", "stepper", "contact")
+AS_GIVEN = "as given"
 STEP = "protocol.time_step_ms"
 NUMERICAL_CONSTANTS = ("time_step_ms", "wall_clock_limit_s")
 
@@ -71,7 +74,7 @@ class Ladder:
 
 
 def without_numerics(design: Design) -> Design:
-    """Return the design without what it says of mesher, elasticity, stepper, contact and time step."""
+    """Return the design without what it says of mesher, stepper, contact and time step."""
     from finqd.design import Design
 
     document = {key: value for key, value in design.to_dict().items() if key not in NUMERICS}
@@ -82,6 +85,8 @@ def without_numerics(design: Design) -> Design:
 def build_ladder(design: Design, *, knobs: Iterable[str] = (), frictionless: bool = False) -> Ladder:
     """Return every rung of the chosen knobs (default: all) that is installed; ``standard`` is always among them.
 
+    A design that sets numerics of its own has a rung for itself as well.
+
     frictionless: without the rungs that change friction only
 
     Raises ``InputError`` for an unknown knob.
@@ -91,6 +96,12 @@ def build_ladder(design: Design, *, knobs: Iterable[str] = (), frictionless: boo
         raise InputError(f"there is no knob {knob!r}; known: {', '.join(KNOBS)}", "--knob")
     base = Rung(name=DEFAULT, knob="preset", series="preset", bare=True)
     rungs, designs = [base], {base.name: base.applied(design)}
+    own = Rung(name=AS_GIVEN, knob="preset", series="preset")
+    designs[own.name] = own.applied(design)
+    if designs[own.name].digest() == designs[base.name].digest():
+        del designs[own.name]
+    else:
+        rungs.append(own)
     missing: dict[str, str] = {}
     for rung in _all_rungs():
         if rung.knob not in chosen or rung.name == base.name or (frictionless and "friction" in rung.name):
@@ -105,25 +116,31 @@ def build_ladder(design: Design, *, knobs: Iterable[str] = (), frictionless: boo
     return Ladder(rungs=tuple(rungs), designs=designs, missing=missing)
 
 
-def reference_rungs(case: str, *, full: bool) -> tuple[Rung, ...]:
-    """Return the reference and what it is checked by: the finest rungs of two element families.
+def reference_rungs(case: str, *, full: bool, swept: bool = True) -> tuple[Rung, ...]:
+    """Return the reference and what it is checked by: fine rungs of two element families.
 
-    A press ends at rest: its force at 40 and at 10 ms differs by 2e-7, so its unknowns are spent on the mesh, which is
-    graded towards the notches between ribs and walls: their stress is singular, and on even meshes it converges at
-    first order only. Quadratic bricks hold it by their nodes; linear ones come near by extrapolation, from two meshes.
-    Other cases depend on the step, and sharp edges do badly on the slivers that grading makes.
+    Unknowns are spent on the mesh, which is graded towards the notches between ribs and walls: their stress is
+    singular, and on even meshes it converges at first order only. Quadratic bricks hold it by their nodes; linear ones
+    come near by extrapolation, from two meshes. A press ends at rest: its force at 40 and at 10 ms differs by 2e-7.
+    What a grasp ends with depends on the step a little (its force by 0.6 % between 20 and 10 ms): 5 ms, or 2.5.
+
+    swept: False for shapes that cannot be; then all there is are two meshes of quadratic tetrahedra
     """
-    if case == "press":
-        step, quadratic, linear = 20.0, (2.0, 3, 2, 2.0), (2.0, 4, 4, 2.0)
-        if full:
-            quadratic, linear = (1.0, 4, 4, 2.0), (1.0, 8, 8, 2.0)
+    if not swept:
+        size, step = (2.0 if full else 3.0), 20.0 if case == "press" else 5.0
+        meshes = [(f"tet10 {one:g} mm", {**_TET10, "mesher.size_mm": one}) for one in (size, 2.0 * size)]
+    else:
+        if case == "press":
+            step, quadratic, linear = 20.0, (2.0, 3, 2, 2.0), (2.0, 4, 4, 2.0)
+            if full:
+                quadratic, linear = (1.0, 4, 4, 2.0), (1.0, 8, 8, 2.0)
+        else:
+            step, quadratic, linear = 5.0, (1.5, 3, 1, 1.5), (2.0, 4, 4, 2.0)
+            if full:
+                step, quadratic, linear = 2.5, (1.5, 4, 2, 2.0), (1.5, 6, 6, 2.0)
         size, layers, least, grading = linear
         meshes = [_graded("hex20", 2, *quadratic), _graded("hex8", 1, *linear),
                   _graded("hex8", 1, 2.0 * size, layers, least // 2, grading)]
-    else:
-        size, layers, tetrahedra, step = (1.0, 12, 2.0, 2.5) if full else (2.0, 8, 4.0, 5.0)
-        meshes = [(f"hex8 {size:g} mm", {**_HEX8, "mesher.size_mm": size, "mesher.layers": layers}),
-                  (f"tet10 {tetrahedra:g} mm", {**_TET10, "mesher.size_mm": tetrahedra})]
     return tuple(
         _rung("reference", "reference", f"{name}, {step:g} ms", {**settings, STEP: step}, bare=True)
         for name, settings in meshes
@@ -216,6 +233,9 @@ def _newton() -> list[Rung]:
     return [
         _rung("newton", "Newton tolerance", f"tolerance {force:g} N", {"stepper.tolerance_N": force})
         for force in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+    ] + [
+        _rung("newton", "friction tolerance", f"friction tolerance {share:g}", {"stepper.friction_tolerance": share})
+        for share in (0.1, 0.02, 0.005)
     ] + [_rung("newton", "quasi-Newton steps", "a new matrix each iteration", {"stepper.quasi_newton": False})]
 
 

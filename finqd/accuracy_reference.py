@@ -9,9 +9,12 @@ from __future__ import annotations
 import json
 import time as clock
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+
+from pydantic import StrictBool, StrictFloat, StrictInt, TypeAdapter, ValidationError
+from typing_extensions import TypedDict
 
 from finqd.accuracy_cases import Case, Quantity
 from finqd.data import studies_folder
@@ -19,7 +22,22 @@ from finqd.errors import InputError
 from finqd.json_input import read_json_object
 
 FORMAT = "finqd accuracy reference"
+Number = StrictBool | StrictInt | StrictFloat
 AGREEMENT_PERCENT = 1.0  # two families that differ by more are no agreement
+
+
+class Family(TypedDict):
+    """What one rung of a reference gave."""
+
+    rung: str
+    options: str
+    status: str
+    reason: str
+    values: Mapping[str, Number]
+    seconds: float
+    dofs: int
+    steps: int
+    newton_iterations: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +50,19 @@ class Reference:
         half as fine
     confirmed_by: the case's quantity by the second family, extrapolated if there are two meshes of it (`extrapolated`)
     difference_percent: between both in the case's quantity, None if only one is there
+    one_family: both meshes are of the same family, which is no agreement whatever they differ by
+    quantity: the case's quantity that ``difference_percent`` is of
     source: "computed" by this study, or "shipped", or a file's name
     """
 
     case: str
     physics: str
-    values: Mapping[str, Any]
-    families: Sequence[Mapping[str, Any]]
+    values: Mapping[str, Number]
+    families: Sequence[Family]
     difference_percent: float | None
     confirmed_by: float | None = None
+    one_family: bool = False
+    quantity: str = "force_N"  # of files that do not say
     source: str = "computed"
     design: str = ""
     date: str = ""
@@ -50,13 +72,16 @@ class Reference:
 
     @property
     def uncertainty_percent(self) -> float:
-        """Half of what the two families differ by: errors below it are not told apart."""
-        return 0.5 * (self.difference_percent or 0.0)
+        """Half of what the two families differ by: errors below it are not told apart. Of one family, all of that:
+        it converges at first order at notches, so that the finer mesh is as far off as the two are apart."""
+        return (1.0 if self.one_family else 0.5) * (self.difference_percent or 0.0)
 
     @property
     def agrees(self) -> bool:
         """Whether there are two families, within `AGREEMENT_PERCENT` of each other."""
-        return self.difference_percent is not None and self.difference_percent <= AGREEMENT_PERCENT
+        if self.one_family or self.difference_percent is None:
+            return False
+        return self.difference_percent <= AGREEMENT_PERCENT
 
     def sentence(self) -> str:
         """Return what a reader has to know."""
@@ -71,6 +96,8 @@ class Reference:
         floor = f"errors below {self.uncertainty_percent:.2g} % are not resolved"
         first = next(str(family["rung"]) for family in self.families if family["status"] == "ok")
         verdict = f"the reference is {first}" if self.agrees else f"that is NO agreement; the reference is {first}"
+        if self.one_family:
+            verdict = f"that is one family alone, and no second one confirms it; the reference is {first}"
         return f"{differ}: {verdict}, and {floor}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,11 +106,12 @@ class Reference:
 
 
 def make_reference(
-    case: Case, physics: str, rows: Sequence[Mapping[str, Any] | None], *, full: bool
+    case: Case, physics: str, rows: Sequence[Mapping[str, Any] | None], *, full: bool, one_family: bool = False
 ) -> Reference | None:
     """Return the first of two families that worked, compared with the other; None if none did.
 
     rows: of the reference, of the second family, and perhaps of the second family on a mesh half as fine.
+    one_family: the second row is of the first one's family, on a mesh half as fine
     """
     done = [row for row in rows if row is not None and row["status"] == "ok"]
     if not done:
@@ -102,15 +130,19 @@ def make_reference(
     if len(main) == len(rows) > 1 and values[case.main] != 0.0:
         other = extrapolated(main[1], main[2]) if len(rows) == 3 else main[1]
     difference = None if other is None else 100.0 * abs(main[0] - other) / abs(values[case.main])
-    keys = ("rung", "options", "status", "reason", "values", "seconds", "dofs", "steps", "newton_iterations")
-    families = [{key: row[key] for key in keys} for row in rows if row is not None]
+    families = [_family(row) for row in rows if row is not None]
     first = done[0]
     return Reference(
         case=case.name, physics=physics, values=values, families=families, difference_percent=difference,
-        confirmed_by=other, design=first["design"], date=clock.strftime("%Y-%m-%d", clock.gmtime()),
+        confirmed_by=other, one_family=one_family, quantity=case.main, design=first["design"],
+        date=clock.strftime("%Y-%m-%d", clock.gmtime()),
         versions=first["versions"], machine=first["machine"],
         repeat=f"finqd accuracy {case.name} --design {first['design']}{' --full' if full else ''} --reference compute",
     )
+
+
+def _family(row: Mapping[str, Any]) -> Family:
+    return Family(**{key: row[key] for key in Family.__annotations__})  # type: ignore[typeddict-item]
 
 
 def extrapolated(fine: float, coarse: float, *, order: float = 2.0) -> float:
@@ -136,10 +168,20 @@ def read_reference(path: Path, *, source: str = "") -> Reference:
     document, _ = read_json_object(path, kind="reference")
     if document.pop("format", None) != FORMAT:
         raise InputError("is no reference of an accuracy study", str(path))
+    unknown = sorted(document.keys() - {one.name for one in fields(Reference)})
     try:
-        return Reference(**document, source=source or path.name)
-    except TypeError as error:
-        raise InputError("is no reference of this version of finqd", str(path)) from error
+        if unknown:
+            raise InputError(f"is no reference of this version of finqd: {unknown[0]} is unknown", str(path))
+        found = TypeAdapter(Reference).validate_python({**document, "source": source or path.name})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise InputError(f"is no reference of this version of finqd: {where}: {first['msg']}", str(path)) from error
+    if not any(family["status"] == "ok" for family in found.families) or found.quantity not in found.values:
+        raise InputError("is no reference: none of its families worked", str(path))
+    if not (found.difference_percent is None or found.difference_percent >= 0.0):
+        raise InputError(f"is no reference: families cannot differ by {found.difference_percent:g} %", str(path))
+    return found
 
 
 def write_reference(path: Path, reference: Reference) -> None:

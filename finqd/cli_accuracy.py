@@ -24,7 +24,8 @@ _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 @click.option("--design", default="benchmark", show_default=True, metavar="DESIGN", help="A file, or a known name.")
 @click.option("--finger", type=int, metavar="I", help="Which finger is pressed, counted from 0 as in the file.")
 @click.option("--object", "grasped", metavar="NAME", help="What is grasped, by name or JSON file.  [default: sphere]")
-@click.option("--knob", "knobs", multiple=True, metavar="NAME", help="Only this knob; may be repeated.  [default: all]")
+@click.option("--knob", "knobs", multiple=True, metavar="NAME", help="Only this knob; may be repeated.  "
+              "[default: all; for --error and --budget those of mesh, step and preset]")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of log, table, picture and page; "
               "a study that is there goes on.  [default: accuracy-CASE]")
 @click.option("--jobs", type=click.IntRange(1, 1024), default=1, show_default=True,
@@ -55,8 +56,11 @@ def accuracy(
     reference = wanted if wanted in ("auto", "compute") else _read_reference(wanted)
     from finqd.accuracy import open_study
     from finqd.accuracy_cases import CASES, case_options
+    from finqd.accuracy_ladder import TRADES
 
     options = case_options(CASES[case], finger=finger, grasped=grasped, design=chosen)
+    if not knobs and (percent is not None or seconds is not None):
+        knobs = TRADES
     folder = out or Path(f"accuracy-{case}")
     study = open_study(chosen, CASES[case], options, folder, knobs=knobs, full=full, limit=most, jobs=jobs)
     usable_folder(folder, "--out")
@@ -67,7 +71,7 @@ def accuracy(
 
 def _answer(study: Study, reference: str | Reference, percent: float | None, seconds: float | None) -> int:
     """Run what is asked for, print it, and return the exit code: 1 if there is no answer."""
-    from finqd.accuracy import REFERENCE, best_within, cheapest_within, disturbed
+    from finqd.accuracy import REFERENCE, best_within, cheapest_within, disturbed, outdated
     from finqd.accuracy_reference import write_reference
     from finqd.accuracy_report import write_report
 
@@ -88,6 +92,9 @@ def _answer(study: Study, reference: str | Reference, percent: float | None, sec
     if late := disturbed(study.table()):
         click.echo(f"finqd: the machine was busy with other work during {len(late)} rungs: their seconds are too long",
                    err=True)
+    if old := outdated(study.table(), study.versions["source"]):
+        click.echo(f"finqd: {len(old)} rungs were measured with another state of finqd's source; move the log away to "
+                   "measure them again", err=True)
     for path in write_report(study):
         click.echo(path)
     for question, row in answers:
@@ -169,6 +176,9 @@ def list_index(knob: str) -> int:
 
 
 def _print_answer(study: Study, question: str, row: Row | None) -> None:
+    from finqd.accuracy_ladder import AS_GIVEN
+    from finqd.presets import PRESETS
+
     if row is None:
         from finqd.accuracy import front
 
@@ -181,4 +191,6 @@ def _print_answer(study: Study, question: str, row: Row | None) -> None:
         click.echo(f"{question}: no rung of this ladder does{hint}{least}")
         return
     cost = f"{abs(row['error_percent']):.3g} % in {row['seconds']:.3g} s"
-    click.echo(f"{question}: {row['rung']}, {cost}\n    {row['options']}")
+    own = any(rung.name == AS_GIVEN for rung in study.rungs) and row["rung"] in PRESETS
+    hint = "    (without what the design itself says of mesher, stepper, contact and time step)\n" if own else ""
+    click.echo(f"{question}: {row['rung']}, {cost}\n{hint}    {row['options']}")

@@ -52,14 +52,27 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
     fitness, margin = _number(result["fitness"], 3), _number(result["margin"], 3)
     console.print(f"fitness {fitness} ({held} of {len(objects)} held), margin {margin}")
     if "accuracy" in result:
-        accuracy = result["accuracy"]
-        line = f"accuracy of the preset {accuracy['preset']}: {accuracy['sentence']}"
-        console.print(escape(line), soft_wrap=True)
+        console.print(escape(_accuracy_line(result["accuracy"])), soft_wrap=True)
     if "estimate" in result:
+        console.print(escape(_forces_line(objects)), soft_wrap=True)
         console.print(_estimate_line(result["estimate"]), soft_wrap=True)
     for part in ("features", "mesh", "effects", "timings", "assumptions"):
         _print_part(console, part, result.get(part))
     _print_part(console, "protocol", result.get("design", {}).get("protocol"))
+
+
+def _accuracy_line(accuracy: Mapping[str, Any]) -> str:
+    """Return what is known of a preset's errors, and from which studies."""
+    studies = accuracy.get("studies", {})
+    named = ", ".join(f"{name} of {study['date']}" for name, study in studies.items() if study["date"])
+    source = f" (studies: {named}; `finqd presets` says how to repeat them)" if accuracy["applies"] and named else ""
+    return f"accuracy of the preset {accuracy['preset']}: {accuracy['sentence']}{source}"
+
+
+def _forces_line(objects: Mapping[str, Mapping[str, Any]]) -> str:
+    forces = {name: row["estimate"]["force_N"] for name, row in objects.items()}
+    told = ", ".join(f"{name} {_number(f, 2)} +- {_number(spread, 2)}" for name, (f, spread) in forces.items())
+    return f"final forces, summed over the fingers [N]: {told}"
 
 
 def _estimate_line(estimate: Mapping[str, Any]) -> str:

@@ -21,7 +21,8 @@ GMSH_DEBIAN_PACKAGES = "libglu1-mesa libgl1 libxcursor1 libxft2 libxinerama1 lib
 LIBRARIES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "gmsh": "gmsh", "trimesh": "trimesh", "fcl": "python-fcl",
     "networkx": "networkx", "ribs": "ribs", "qdldl": "qdldl", "shapely": "shapely",
-    "meshio": "meshio", "pydantic": "pydantic", "rich": "rich", "matplotlib": "matplotlib", "click": "click",
+    "meshio": "meshio", "pydantic": "pydantic", "typing_extensions": "typing-extensions", "rich": "rich",
+    "matplotlib": "matplotlib", "click": "click",
     "annotated_types": "annotated-types", "threadpoolctl": "threadpoolctl",
 }
 

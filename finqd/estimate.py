@@ -1,19 +1,21 @@
 """How far off one result is likely to be: the same grasps again, one level away in mesh and in time step.
 
-Two companions run for every object, each away from the result in one thing only: a mesh whose elements are about half
-as long again, and steps twice as long (half as long where stability sets their length). From the difference d to a
-companion whose elements (or steps) are rho times as long, Richardson's extrapolation takes the error of the result
-itself as d / |rho^p - 1|, for a method of order p (Roache, J. Fluids Eng. 116, 1994). The spread is the sum of both,
-taken as absolute values.
+Two or three companions run for every object, each away from the result in one thing only: a mesh whose elements are
+about half as long again; one with half as many layers through the finger's thickness, where the design sets their
+number (twice as many instead of one); and steps twice as long (half as long where stability sets their length). Size
+and layers are apart since their errors have opposite signs in bending (large elements are stiff, few layers soft) and
+would hide each other. From the difference d to a companion whose elements (or steps) are rho times as long,
+Richardson's extrapolation takes the error of the result itself as d / |rho^p - 1|, for a method of order p (Roache, J.
+Fluids Eng. 116, 1994). The spread is the sum of all, taken as absolute values.
 
 What is taken for the order: p = 1 in the mesh and q = 1 in the step, whatever the elements and the stepper. Both can be
 of second order or better where the solution is smooth; contact that comes and goes is not, and corners of ribs are not.
 A lower order makes the estimate larger.
 
 What is taken for rho: what came about, not what was asked for. In the mesh it is the cube root of the ratio of the
-numbers of elements (a profile of thin walls leaves a mesher little choice, and then a mesh for a larger size is hardly
-coarser); in time, the ratio of the numbers of steps, from 1/2 to 2. If no coarser mesh is to be had, a finer one is
-taken.
+numbers of elements, the square root where their number through the thickness is held (a profile of thin walls leaves a
+mesher little choice, and then a mesh for a larger size is hardly coarser), and the ratio itself for layers; in time,
+the ratio of the numbers of steps, from 1/2 to 2. If no coarser mesh is to be had, a finer one is taken.
 
 An estimate is no bound. It sees what a coarser level sees: a grasp that slips only on much finer meshes escapes it.
 """
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 
 MESH_FACTORS = (1.5, 2.0, 1 / 1.5)  # on the element size, tried in this order
 STEP_FACTOR = 2.0
+LAYER_FACTOR = 2
 LEAST_RATIO = 1.15  # two levels nearer to each other than this say nothing about an error
 MESH_ORDER = 1.0
 STEP_ORDER = 1.0
@@ -190,11 +193,13 @@ def richardson(ratio: float, order: float) -> float:
     return 1.0 / abs(ratio**order - 1.0)
 
 
-def _levels(evaluation: Evaluation) -> tuple[_Level, _Level]:
+def _levels(evaluation: Evaluation) -> tuple[_Level, ...]:
     design = evaluation.design
     solids = [design.plugin("geometry").build(design.finger_si(i)) for i in range(len(design.fingers))]
     longer = _step_level(design, solids)  # first: its meshes are those of the evaluation, which are kept for a while
-    return _mesh_level(evaluation, solids), longer
+    sized = _mesh_level(evaluation, solids)
+    layered = layer_settings(design.plugin("mesher"))
+    return (sized, longer) if layered is None else (sized, _layer_level(design, solids, *layered), longer)
 
 
 def _step_level(design: Design, solids: Sequence[Any]) -> _Level:
@@ -207,6 +212,32 @@ def _step_level(design: Design, solids: Sequence[Any]) -> _Level:
     except (MeshError, InputError) as error:
         return _Level(name=name, settings=settings, design=design, reason=f"no other steps could be taken: {error}")
     return _Level(name=name, settings=settings, design=changed, meshes=meshes)
+
+
+def _layer_level(design: Design, solids: Sequence[Any], name: str, settings: Mapping[str, Any], ratio: float) -> _Level:
+    """Return the level with another number of layers."""
+    from finqd.evaluate import finger_meshes
+
+    try:
+        changed = design.with_overrides(settings)
+        meshes = finger_meshes(changed, solids)
+    except (MeshError, InputError) as error:
+        return _Level(name=name, settings=settings, design=design, reason=f"no other layers could be made: {error}")
+    return _Level(name=name, settings=settings, design=changed, meshes=meshes, ratio=ratio)
+
+
+def layer_settings(mesher: Any) -> tuple[str, dict[str, Any], float] | None:
+    """Return name, settings (as overrides) and ratio of the level in the number of layers; None if it is not set.
+
+    >>> from types import SimpleNamespace
+    >>> layer_settings(SimpleNamespace(layers=3)), layer_settings(SimpleNamespace(layers=1))
+    (('fewer_layers', {'mesher.layers': 2}, 1.5), ('more_layers', {'mesher.layers': 2}, 0.5))
+    """
+    layers = getattr(mesher, "layers", None)
+    if layers is None:
+        return None
+    other = LAYER_FACTOR if layers == 1 else math.ceil(layers / LAYER_FACTOR)
+    return "more_layers" if other > layers else "fewer_layers", {"mesher.layers": other}, layers / other
 
 
 def step_settings(design: Design) -> tuple[str, dict[str, Any]]:
@@ -242,7 +273,8 @@ def _mesh_level(evaluation: Evaluation, solids: Sequence[Any]) -> _Level:
             reason = str(error)
             continue
         count = sum(len(block) for mesh in meshes for block in mesh.blocks.values())
-        ratio = (elements / count) ** (1 / 3)
+        held = getattr(design.plugin("mesher"), "layers", None) is not None
+        ratio = (elements / count) ** (1 / 2 if held else 1 / 3)
         if max(ratio, 1 / ratio) >= LEAST_RATIO and (ratio > 1) == (factor > 1):
             return _Level(name=name, settings=settings, design=changed, meshes=meshes, ratio=ratio)
         reason = f"{count} elements instead of {elements} are no other level"
@@ -253,16 +285,15 @@ def _mesh_level(evaluation: Evaluation, solids: Sequence[Any]) -> _Level:
 def mesh_settings(mesher: Any, factor: float) -> dict[str, Any]:
     """Return the mesher's options for elements ``factor`` times as long, as overrides.
 
-    Raises InputError for a mesher without ``size_mm``. Numbers of elements (``layers``, ``least_edges``) change the
-    other way round where they are set; one element stays one.
+    Raises InputError for a mesher without ``size_mm``. The number of elements through a wall (``least_edges``) changes
+    the other way round where it is set; one element stays one. For layers see `layer_settings`.
     """
     if not hasattr(mesher, "size_mm"):
         raise InputError("the mesher has no option size_mm")
     settings: dict[str, Any] = {"mesher.size_mm": mesher.size_mm * factor}
-    for key in ("layers", "least_edges"):
-        number = getattr(mesher, key, None)
-        if number is not None and number > 1:
-            settings[f"mesher.{key}"] = max(1, round(number / factor))
+    number = getattr(mesher, "least_edges", None) or 1
+    if number > 1:
+        settings["mesher.least_edges"] = max(1, round(number / factor))
     return settings
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,7 +80,8 @@ class Evaluation:
             "features": dict(self.features),
             "objects": {name: self._row(name, trajectory) for name, trajectory in self.trajectories.items()},
             "mesh": dict(self.mesh), "timings": dict(self.timings), "effects": effects_of(self.design),
-            "assumptions": [*ASSUMPTIONS, *self.object_assumptions, *self.design.warnings], "versions": versions(),
+            "assumptions": [*ASSUMPTIONS, *self.object_assumptions, *self.design.warnings],
+            "versions": dict(versions()),
         }
 
     def _row(self, name: str, trajectory: Trajectory) -> dict[str, Any]:
@@ -239,15 +242,23 @@ def _write_record(folder: Path, task: GraspTask, trajectory: Trajectory) -> None
     )
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of finqd and of the libraries that can change a result."""
+@cache
+def versions() -> Mapping[str, str]:
+    """Return the versions of finqd and of the libraries that can change a result, and ``source``: `source_digest`."""
     found = {}
     for name in LIBRARIES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return {**found, "source": source_digest()}
+
+
+def source_digest() -> str:
+    """Return the first digits of a digest of finqd's own source, which changes more often than its version."""
+    package = Path(__file__).parent
+    text = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
+    return hashlib.sha256(text).hexdigest()[:12]
 
 
 def _finite(value: float) -> float | None:

@@ -206,7 +206,9 @@ def _evaluated(
 
     found = evaluate(design, objects=objects, preset=preset, jobs=1, progress=move)
     record = {"fitness": found.fitness, "margin": found.margin, "features": dict(found.features)}
-    return {**record, "objects": found.to_dict().get("objects", {}), "seconds": time.perf_counter() - begin}
+    result = found.to_dict()
+    record |= {"accuracy": result.get("accuracy", {}).get("sentence"), "objects": result.get("objects", {})}
+    return {**record, "seconds": time.perf_counter() - begin}
 
 
 def _default_evaluator() -> Evaluator:

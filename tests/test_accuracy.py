@@ -21,9 +21,11 @@ from finqd.accuracy import (
     front,
     measure_rung,
     open_study,
+    outdated,
 )
 from finqd.accuracy_cases import CASES, case_options, measured
 from finqd.accuracy_ladder import (
+    AS_GIVEN,
     KNOBS,
     Rung,
     as_options,
@@ -156,11 +158,23 @@ def test_a_knob_alone_comes_with_standard_and_an_unknown_one_is_refused(design):
 
 def test_presets_and_reference_do_not_depend_on_what_the_design_says_of_its_numerics(design):
     own = design.with_overrides({"mesher.size_mm": 7, "protocol.time_step_ms": 3, "protocol.hold_s": 2})
-    for rung in [r for r in build_ladder(own).rungs if r.knob == "preset"] + list(reference_rungs("press", full=True)):
+    rungs = [r for r in build_ladder(own).rungs if r.name in PRESETS] + list(reference_rungs("press", full=True))
+    for rung in rungs:
         assert rung.applied(own).digest() == rung.applied(design.with_overrides({"protocol.hold_s": 2})).digest()
     assert without_numerics(own).protocol.hold_s == 2.0
+    given = next(rung for rung in build_ladder(own).rungs if rung.name == AS_GIVEN)
+    assert given.applied(own).digest() == apply_preset(own, "standard").digest()
+    assert all(rung.name != AS_GIVEN for rung in build_ladder(design).rungs)
     step = next(rung for rung in build_ladder(own).rungs if rung.name == "step 5 ms")
     assert step.applied(own).plugin("mesher").size_mm == 7.0  # a knob is turned on the design as it is
+
+
+def test_the_law_of_a_design_is_its_reference_s_and_its_presets_too(design, tmp_path):
+    own = design.with_overrides({"elasticity": "neo_hookean"})
+    rungs = [r for r in build_ladder(own).rungs if r.name in PRESETS] + list(reference_rungs("press", full=False))
+    assert {rung.applied(own).spec("elasticity")["name"] for rung in rungs} == {"neo_hookean"}
+    studies = [open_study(one, CASES["press"], {"finger": 0}, tmp_path) for one in (design, own)]
+    assert studies[0].physics != studies[1].physics
 
 
 def test_the_reference_is_made_by_two_families(design):
@@ -171,8 +185,7 @@ def test_the_reference_is_made_by_two_families(design):
             assert kinds[0] != kinds[1]
             assert first.protocol.time_step_ms == second.protocol.time_step_ms
             mesher = first.plugin("mesher")
-            assert mesher.size_mm / mesher.least_edges < 2.7 and (case != "press" or mesher.grading > 1.0)
-            assert len(half) == (case == "press")
+            assert mesher.size_mm / mesher.least_edges < 2.7 and mesher.grading > 1.0 and len(half) == 1
             for coarse in half:  # a mesh half as fine, by which the second family is extrapolated
                 one, other = second.plugin("mesher"), coarse.plugin("mesher")
                 assert (other.size_mm, 2 * other.least_edges) == (2 * one.size_mm, one.least_edges)
@@ -222,6 +235,16 @@ def test_a_row_says_what_was_run_and_with_what(study_in, tmp_path):
     exact = study.reference.values["force_N"]
     assert row["errors"]["force_N"] == pytest.approx(100 * (row["values"]["force_N"] / exact - 1))
     assert row["wall_seconds"] < 1.0 and row["seconds"] == pytest.approx(2.5)
+
+
+def test_rows_of_another_state_of_the_source_stay_and_are_told_of(study_in, tmp_path):
+    study = study_in(tmp_path, knobs=["step"])
+    study.run(study.rungs)
+    other = study_in(tmp_path, knobs=["step"])
+    other.__dict__["versions"] = {**study.versions, "source": "another"}
+    other.run(other.rungs)
+    assert other.runner.ran == [] and outdated(study.table(), study.versions["source"]) == []
+    assert len(outdated(other.table(), "another")) == len(other.table()) > 3
 
 
 def test_other_versions_are_run_again(study_in, tmp_path):
@@ -315,6 +338,41 @@ def test_one_family_alone_and_none(study_in, tmp_path):
     assert make_reference(study.case, "p", [bad, None], full=False) is None
 
 
+def test_a_shape_that_cannot_be_swept_has_a_reference_of_tetrahedra(study_in, tmp_path):
+    study = study_in(tmp_path, knobs=["step"])
+
+    def tetrahedra_only(design, options, limit, progress):
+        if design.spec("mesher")["name"] == "swept":
+            return measured(status="mesh_failed", reason="no profile")
+        return fake_press(design, options, limit, progress)
+
+    study.case = replace(study.case, measure=tetrahedra_only)
+    study.set_reference("compute")
+    fine, coarse = (rung.applied(study.design).plugin("mesher") for rung in study.reference_rungs())
+    assert (fine.order, coarse.order, coarse.size_mm) == (2, 2, 2 * fine.size_mm)
+    assert [family["status"] for family in study.reference.families] == ["ok", "ok"]
+    assert not study.reference.agrees and "one family alone" in study.reference.sentence()
+    assert study.reference.uncertainty_percent == study.reference.difference_percent > 0.0
+
+
+def test_a_series_that_ran_out_of_time_is_not_gone_on_with(study_in, tmp_path):
+    study = study_in(tmp_path, knobs=["step"], limit=60.0)
+
+    def slow(design, options, limit, progress):
+        if design.protocol.time_step_ms <= 10:
+            return measured(status="timeout", reason="slow", seconds=limit)
+        return fake_press(design, options, limit, progress)
+
+    study.case = replace(study.case, measure=slow)
+    study.run(study.rungs)
+    late = [row["rung"] for row in study.rows if row["status"] == "timeout"]
+    assert late == ["step 10 ms"] and {"step 5 ms", "step 2.5 ms"} <= study.omitted.keys()
+    assert study.omitted["step 5 ms"] == "step 10 ms, which is to cost less, took over 60 s"
+    again = study_in(tmp_path, knobs=["step"], limit=60.0)
+    again.case = study.case
+    assert cheapest_within(again, 1e-9) is None and again.runner.ran == [], "not after a resume, nor one by one"
+
+
 def test_no_reference_means_values_without_errors(study_in, tmp_path):
     study = study_in(tmp_path, knobs=["step"])
     study.run(study.rungs)
@@ -348,6 +406,22 @@ def test_a_reference_reads_back_and_fits_only_its_own_physics(study_in, tmp_path
     assert fresh.runner.ran == [] and fresh.reference.source == "shipped" and fresh.reference_rungs() == ()
     with pytest.raises(InputError, match="is no reference"):
         read_reference(ROOT / "designs" / "benchmark.json")
+    other = open_study(design.with_overrides({"finger.rib_count": 4}), study.case, {"finger": 0}, tmp_path)
+    with pytest.raises(InputError, match="^--reference shipped: is of another case or another physics: press of"):
+        other.set_reference(found)
+
+
+@pytest.mark.parametrize(("key", "value"), [
+    ("families", 3), ("families", []), ("families", [{}]), ("families", [{"rung": "a", "status": "ok"}]),
+    ("values", None), ("values", {}), ("values", {"force_N": "5.286"}), ("difference_percent", "much"),
+    ("difference_percent", -3), ("case", None), ("surprise", 1),
+])
+def test_a_reference_that_is_damaged_is_refused_in_a_sentence(tmp_path, key, value):
+    whole = json.loads((studies_folder() / "reference_press_benchmark.json").read_text())
+    path = tmp_path / "r.json"
+    path.write_text(json.dumps({**whole, key: value}))
+    with pytest.raises(InputError, match="is no reference"):
+        read_reference(path)
 
 
 @pytest.mark.parametrize("path", sorted(studies_folder().glob("reference_*.json")), ids=lambda path: path.stem)

@@ -92,9 +92,11 @@ def test_evaluate_prints_a_row_an_object_with_its_numbers_and_the_reason_of_a_fa
 
 
 def test_an_error_estimate_is_asked_for_and_shown(run, evaluated):
-    sure = {"drop_mm": [0.1234, 0.05], "uncertain": False, "reason": ""}
-    flips = {"drop_mm": [-30.0, 12.34], "uncertain": True, "reason": "lost, but held with the [coarser] mesh"}
-    failed = {"drop_mm": [None, None], "uncertain": True, "reason": "the simulation itself: diverged"}
+    sure = {"drop_mm": [0.1234, 0.05], "force_N": [7.25, 0.4], "uncertain": False, "reason": ""}
+    why = "lost, but held with the [coarser] mesh"
+    flips = {"drop_mm": [-30.0, 12.34], "force_N": [3.0, None], "uncertain": True, "reason": why}
+    why = "the simulation itself: diverged"
+    failed = {"drop_mm": [None, None], "force_N": [None, None], "uncertain": True, "reason": why}
     rows = {name: {**ROWS[name], "estimate": one} for name, one in zip(ROWS, (sure, flips, failed))}
     whole = {"uncertain": 2, "objects": 3, "seconds": {"base": 12.54, "coarser_mesh": 4.0, "longer_step": 7.0}}
     evaluated.result = {**RESULT, "objects": rows, "estimate": whole}
@@ -102,6 +104,7 @@ def test_an_error_estimate_is_asked_for_and_shown(run, evaluated):
     assert code == 0 and evaluated.calls[0]["estimate_error"]
     lines = {line.split()[0]: line.split() for line in out.splitlines() if line.strip()}
     assert lines["sphere"][1:5] == ["yes", "0.12", "+-", "0.05"]
+    assert "final forces, summed over the fingers [N]: sphere 7.25 +- 0.40, cube 3.00 +- -, pasta - +- -\n" in out
     assert next(line for line in out.splitlines() if line.startswith("cube ")).split()[1:6] == [
         "no", "?", "30.00", "+-", "12.34"]
     assert "\ncube: uncertain: lost, but held with the [coarser] mesh\n" in out

@@ -34,7 +34,7 @@ MM = 1e-3
 #: far too coarse, and over at once: what counts here is that everything runs
 TINY = {
     "actuation.duration_s": 0.1, "protocol.close_s": 0.1, "protocol.squeeze_s": 0.0, "protocol.lift_s": 0.04,
-    "protocol.lift_mm": 2.0, "protocol.hold_s": 0.0, "protocol.time_step_ms": 10.0, "mesher.size_mm": 8.0,
+    "protocol.lift_mm": 2.0, "protocol.hold_s": 0.0, "protocol.time_step_ms": 10.0, "mesher.size_mm": 5.0,
     "mesher.layers": 2,
 }
 
@@ -92,8 +92,9 @@ def test_the_spread_is_the_sum_of_both_differences_extrapolated():
 
 
 def test_differences_of_opposite_sign_do_not_cancel():
-    found = estimated(grasp(1.0), mesh(grasp(1.5), ratio=2.0), step(grasp(0.5)))
-    assert found.drop[1] == pytest.approx(1.0 * MM)
+    layers = Companion(level="fewer_layers", trajectory=grasp(0.7), ratio=2.0, order=1.0)
+    found = estimated(grasp(1.0), mesh(grasp(1.5), ratio=2.0), layers, step(grasp(0.5)))
+    assert found.drop[1] == pytest.approx(1.3 * MM)
 
 
 # -- what makes a verdict uncertain ----------------------------------------------------------------
@@ -160,7 +161,7 @@ def test_a_result_that_failed_is_uncertain_but_no_room_is_no_room():
 def test_every_number_of_elements_of_a_mesher_goes_with_its_size():
     assert mesh_settings(Swept(size_mm=4.0), 1.5) == {"mesher.size_mm": 6.0}
     full = mesh_settings(Swept(size_mm=2.0, layers=9, least_edges=3), 1.5)
-    assert full == {"mesher.size_mm": 3.0, "mesher.layers": 6, "mesher.least_edges": 2}
+    assert full == {"mesher.size_mm": 3.0, "mesher.least_edges": 2}, "layers are a level of their own"
     assert mesh_settings(Swept(layers=1), 1.5) == {"mesher.size_mm": 6.0}
     assert mesh_settings(Tetrahedral(size_mm=2.0), 2.0) == {"mesher.size_mm": 4.0}
     with pytest.raises(InputError, match="^the mesher has no option size_mm$"):
@@ -196,16 +197,18 @@ def test_a_real_estimate_leaves_the_result_alone_and_says_what_it_cost(plain):
     whole = result["estimate"]
     assert whole["objects"] == 2 and whole["uncertain"] == sum(
         row["estimate"]["uncertain"] for row in result["objects"].values())
-    name = next(level for level in whole["levels"] if level != "longer_step")
+    name = next(iter(whole["levels"]))
+    assert list(whole["levels"]) == [name, "fewer_layers", "longer_step"]
+    assert whole["levels"]["fewer_layers"]["settings"] == {"mesher.layers": 1}
     level = whole["levels"][name]
     assert level["elements"] != sum(result["mesh"]["elements"].values())
     assert max(level["ratio"], 1 / level["ratio"]) >= LEAST_RATIO and (level["ratio"] > 1) == (name == "coarser_mesh")
     assert whole["levels"]["longer_step"]["settings"] == {"protocol.time_step_ms": 20.0}
-    assert whole["seconds"].keys() == {"base", name, "longer_step"} and min(whole["seconds"].values()) > 0
+    assert whole["seconds"].keys() == {"base", *whole["levels"]} and min(whole["seconds"].values()) > 0
     assert {"sphere", "disk", "sphere (longer step)", f"disk ({name.replace('_', ' ')})"} <= set(told)
     for row in result["objects"].values():
         estimate = row["estimate"]
-        assert estimate["verdicts"].keys() == {"base", name, "longer_step"}
+        assert estimate["verdicts"].keys() == {"base", *whole["levels"]}
         assert estimate["force_N"][0] == pytest.approx(sum(row["final_contact_force_N"]))
         assert estimate["drop_mm"][0] == pytest.approx(row["drop_mm"])
         assert 0 < estimate["drop_mm"][1] < math.inf and estimate["force_N"][1] > 0
@@ -221,9 +224,12 @@ def test_an_estimate_of_an_evaluation_runs_each_companion_once_and_in_one_go(pla
     monkeypatch.setattr(pipeline, "run_grasps", run_grasps)
     estimate = estimate_error(plain, jobs=2)
     (tasks,) = calls
-    assert len(tasks) == 4 and {task.grasped.name for task in tasks} == {"sphere", "disk"}
-    dofs = {task.design.protocol.time_step_ms: sum(m.n_vertices for m in task.meshes) for task in tasks}
-    assert dofs[20.0] == plain.mesh["vertices"] != dofs[10.0], "each differs in one thing only"
+    assert len(tasks) == 6 and {task.grasped.name for task in tasks} == {"sphere", "disk"}
+    of_sphere = [task for task in tasks if task.grasped.name == "sphere"]
+    numbers = [(t.design.protocol.time_step_ms, t.design.plugin("mesher").size_mm, t.design.plugin("mesher").layers,
+                sum(m.n_vertices for m in t.meshes) == plain.mesh["vertices"]) for t in of_sphere]
+    (size,) = {n[1] for n in numbers} - {TINY["mesher.size_mm"]}
+    assert numbers == [(10.0, size, 2, False), (10.0, 5.0, 1, False), (20.0, 5.0, 2, True)], "each in one thing only"
     assert estimate.objects["disk"].drop[1] == 0.0, "what does not change has no spread"
 
 
@@ -231,7 +237,7 @@ def test_a_mesh_that_cannot_be_made_coarser_or_finer_leaves_all_uncertain(plain,
     mesh_solid = pipeline.mesh_solid
 
     def only_this_size(mesher, solid):
-        if mesher.size_mm != TINY["mesher.size_mm"]:
+        if mesher.size_mm != TINY["mesher.size_mm"] or mesher.layers != TINY["mesher.layers"]:
             raise MeshError("the mesher gave up")
         return mesh_solid(mesher, solid)
 
@@ -239,6 +245,7 @@ def test_a_mesh_that_cannot_be_made_coarser_or_finer_leaves_all_uncertain(plain,
     monkeypatch.setattr(pipeline, "run_grasps", lambda tasks, **_: [plain.trajectories[t.grasped.name] for t in tasks])
     estimate = estimate_error(plain)
     assert estimate.levels["coarser_mesh"]["reason"] == "no other mesh could be made: the mesher gave up"
+    assert estimate.levels["fewer_layers"]["reason"] == "no other layers could be made: the mesher gave up"
     for one in estimate.objects.values():
         assert one.uncertain and "the mesher gave up" in one.reason and one.to_dict()["drop_mm"][1] is None
 

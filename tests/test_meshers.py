@@ -25,7 +25,7 @@ from finqd.meshing import close_mesher, mesh_solid
 from finqd.plugins.geometry_fin_ray import FinRay
 from finqd.plugins.mesher_swept import Swept
 from finqd.plugins.mesher_tetrahedral import Tetrahedral
-from finqd.plugins.swept_patches import PlaneMesh, edge_counts, graded
+from finqd.plugins.swept_patches import PlaneMesh, edge_counts, graded, mesh_patches
 from finqd.plugins.swept_paving import cut_into_quads
 from finqd.solid import Prism, Solid, SurfaceSolid
 from finqd.units import DEG, MM
@@ -193,6 +193,18 @@ def test_grading_shrinks_the_edges_at_notches_and_leaves_the_rest_as_it_was() ->
     assert np.array_equal(graded(5, 1.0), np.linspace(0.0, 1.0, 6))
     shares = graded(5, 3.0)
     assert np.allclose(shares + shares[::-1], 1.0) and np.all(np.diff(shares) > 0.0)
+
+
+def test_a_profile_that_grading_skews_is_graded_less_rather_than_paved(monkeypatch: pytest.MonkeyPatch) -> None:
+    lengths = {"length": 109.9, "width": 28.4, "thickness": 35.0, "tip_length": 29.9, "contact_wall": 2.0,
+               "back_wall": 2.7, "rib_thickness": 1.5}
+    finger = {**{name: one * MM for name, one in lengths.items()}, "rib_count": 8, "rib_angle": 0.0}
+    solid = FinRay().build(finger)
+    worst = {g: mesh_patches(solid.patches, 2.5 * MM, 1, g).worst() for g in (1.5, 1.25)}
+    assert worst[1.5] < 0.1 < worst[1.25]
+    monkeypatch.setattr("finqd.plugins.swept_paving.pave_with_quads", lambda *_: pytest.fail("paved"))
+    mesher = Swept(size_mm=2.5, layers=2, grading=1.5, order=2)
+    assert mesher._plane(solid).worst() == pytest.approx(worst[1.25])
 
 
 def test_quarter_nodes_stand_at_the_notches_and_nowhere_else() -> None:

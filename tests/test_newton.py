@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from finqd.mechanics import newton
-from finqd.mechanics.newton import Newton, NewtonOptions
+from finqd.mechanics.newton import Newton, NewtonOptions, _Convexity
 from finqd.mechanics.state import Direction, StepReport
 
 HEAVY, LIGHT = 5.0, 0.5 * newton.LAG_FORCE  # [N] contact force
@@ -109,3 +109,14 @@ def test_a_search_across_a_kink_ends_at_the_kink() -> None:
     moved, found = search(state(0.0), energy, Direction(soft=np.ones(1), rigid=np.zeros(0)), -1.0)
     assert kink - width < moved.x < kink + width and found == gradient(moved) < energy
     assert report.line_searches <= newton.ENOUGH + 1
+
+
+def test_the_exact_matrix_is_tried_again_once_the_residual_has_fallen() -> None:
+    convexity = _Convexity()
+    assert convexity.tries(1.0) == (False, True)
+    convexity.lost = True  # what `_iterate` notes where only the projected matrix leads downhill
+    assert convexity.tries(0.9) == (True, False)
+    assert convexity.tries(0.8) == (True, False), "not near enough"
+    assert convexity.tries(0.2) == (False, True)
+    convexity.lost = True
+    assert [convexity.tries(0.2)[0] for _ in range(newton.PROJECTED + 1)] == [True] * newton.PROJECTED + [False]

@@ -111,11 +111,12 @@ def test_bad_overrides_are_one_sentence(overrides, sentence):
 def studied(monkeypatch):
     """A file of bands in which `standard` has been measured."""
     numbers = dict.fromkeys(MEASURED)
-    row = {**numbers, "settings": PRESETS["standard"], "press_force_error_percent": 3.21, "verdict_flips_percent": 2.0}
+    known = {"press_force_error_percent": 3.21, "press_fingers_error_percent": 7.5, "verdict_flips_percent": 2.0}
+    row = {**numbers, "settings": PRESETS["standard"], **known}
     study = {"title": "a press", "date": "2026-01-31", "versions": {}, "repeat": "finqd accuracy press"}
     document = {
         "valid_for": {"geometry": "fin_ray", "poisson_ratio": 0.49}, "presets": {"standard": row},
-        "studies": {"press": study, "grasp": {**study, "title": "grasps"}},
+        "studies": {"press": study, "press_fingers": study, "grasp": {**study, "title": "grasps"}},
     }
     monkeypatch.setattr(accuracy_bands, "bands", lambda: document)
     return document
@@ -127,7 +128,8 @@ def measured(**overrides) -> dict:
 
 def test_a_measured_preset_says_how_far_off_it_is_and_from_which_studies(studied):
     found = measured()
-    assert found["applies"] and found["sentence"] == "force of a press 3.2 % off, 2 % of verdicts flip"
+    sentence = "force of a press 3.2 % off, on 9 of 10 fingers within 7.5 %, 2 % of verdicts flip"
+    assert found["applies"] and found["sentence"] == sentence
     assert found["press_force_error_percent"] == 3.21 and found["drop_error_mm"] is None
     assert found["studies"]["press"]["repeat"] == "finqd accuracy press" and "grasp" in found["studies"]
     assert json.loads(json.dumps(found, allow_nan=False)) == found
@@ -135,7 +137,7 @@ def test_a_measured_preset_says_how_far_off_it_is_and_from_which_studies(studied
 
 def test_what_no_study_has_measured_is_named_by_none(studied):
     studied["presets"]["standard"]["verdict_flips_percent"] = None
-    assert measured()["studies"].keys() == {"press"}
+    assert measured()["studies"].keys() == {"press", "press_fingers"}
 
 
 @pytest.mark.parametrize("overrides, sentence", [

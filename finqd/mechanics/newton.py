@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -27,6 +27,8 @@ RELAXATIONS = 60  # iterations of rigid bodies alone in a step, and as many more
 FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 HALVINGS = 31  # of the Newton step, before the line search gives up
 ENOUGH = 12  # halvings after which it is content with the lowest energy so far
+NEARER = 0.3  # share of the residual by which an iteration must get on for the exact matrix to be tried again
+PROJECTED = 3  # iterations after which it is in any case: by projected ones Newton converges linearly
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
 BLURRED = 1e-6  # relative rise of an energy that may be rounding, if the slope along the step falls to
 FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and Zhang, SIAM J. Optim. 16 (2005) 170).
@@ -86,6 +88,24 @@ class _Renewals:
     best_jump: float = np.inf
 
 
+@dataclass
+class _Convexity:
+    """Which matrix an iteration begins with: the exact one, unless the one before found no descent by that.
+
+    lost: whether it did not; residual: before it [N]; row: how many have begun with the projected one since
+    """
+
+    lost: bool = False
+    residual: float = np.inf
+    row: int = 0
+
+    def tries(self, residual: float) -> tuple[bool, bool]:
+        """Return in which order matrices are tried from a state with ``residual`` [N]: whether projected."""
+        self.lost = self.lost and residual > NEARER * self.residual and self.row < PROJECTED
+        self.residual, self.row = residual, self.row + 1 if self.lost else 0
+        return self.lost, not self.lost
+
+
 @dataclass(frozen=True, kw_only=True)
 class Newton:
     """The minimisation of one ``increment``; ``report`` says how it went."""
@@ -94,6 +114,7 @@ class Newton:
     increment: Increment
     options: NewtonOptions
     report: StepReport
+    convexity: _Convexity = field(default_factory=_Convexity)
 
     def minimise(self, trial: State) -> State:
         """Return the minimum that is found from ``trial``; it is one only if ``report.converged``."""
@@ -237,10 +258,12 @@ class Newton:
 
     def _iterate(self, trial: State, energy: float) -> tuple[State, float] | None:
         """Do one Newton iteration; return where it led, as `_search` does, or None if no direction leads downhill."""
-        report = self.report
-        for projected in (False, True):
-            if projected:  # the first search has left the gradient of another state
+        report, convexity = self.report, self.convexity
+        for second, projected in enumerate(convexity.tries(report.residual)):
+            if second:  # the first search has left the gradient of another state
                 self.increment.gradient(trial)
+            convexity.lost = projected
+            report.projections += int(projected)
             self.increment.hessian(trial, projected=projected)
             solution = self._solve()
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
@@ -249,7 +272,6 @@ class Newton:
                 moved = self._search(trial, energy, direction, slope)
                 if moved is not None:
                     return moved
-            report.projections += 1
         report.reason = f"the line search found no descent: {report.residual:.3g} N left on {report.where}"
         return None
 

@@ -18,6 +18,7 @@ from finqd.solid import Patch, Prism, Solid
 from finqd.units import MM
 
 _GOOD_ENOUGH = 0.1  # sine of the worst corner above which no second mesh is tried
+_MILDER = (0.5, 0.0)  # shares of the grading that are tried where all of it skews elements too much
 _AREA = 1e-9  # relative difference that rounding may leave
 _LAYER = 1.25  # layers are that much longer than the size: bending leaves the thickness almost straight
 _CORNER = np.radians(150.0)  # a profile's corner below this angle is a corner of its patch
@@ -27,14 +28,14 @@ _CORNER = np.radians(150.0)  # a profile's corner below this angle is a corner o
 class Swept:
     """Quadrilaterals in a prism's profile, swept along its thickness: hexahedra, and wedges where triangles remain.
 
-    ``size_mm``: edge length aimed at in the profile; ``layers``: elements along the thickness, null for
-    thickness / (1.25 size), at least 2; ``least_edges``: elements through a wall at least; ``grading``: above 1, edges
-    shrink towards the notches between walls and ribs, with that exponent (patches only); ``notch_nodes``: "quarter"
-    puts mid-edge nodes next to a notch at a quarter of their edge, where they follow its stress (order 2 only). A
-    profile that comes in patches, or is one patch itself (a triangle or a quadrilateral without holes), is meshed by
-    interpolation, without wedges; any other by gmsh. ``order``: 2 gives quadratic hexahedra (hex20, straight edges, a
-    node in the middle of each); there is no quadratic wedge, so that a profile whose mesh leaves triangles is meshed
-    twice as coarse then, and all its elements are cut into quadrilaterals.
+    ``size_mm``: edge length aimed at in the profile; ``layers``: elements along the thickness, null for thickness /
+    (1.25 size), at least 2; ``least_edges``: elements through a wall at least; ``grading``: above 1, edges shrink
+    towards the notches between walls and ribs, with that exponent (patches only; less where that would skew elements);
+    ``notch_nodes``: "quarter" puts mid-edge nodes next to a notch at a quarter of their edge, where they follow its
+    stress (order 2 only). A profile that comes in patches, or is one patch itself (a triangle or a quadrilateral
+    without holes), is meshed by interpolation, without wedges; any other by gmsh. ``order``: 2 gives quadratic
+    hexahedra (hex20, straight edges, a node in the middle of each); there is no quadratic wedge, so that a profile
+    whose mesh leaves triangles is meshed twice as coarse then, and all its elements are cut into quadrilaterals.
     ``tetrahedra``: each hexahedron is cut into six, each wedge into three: another family of elements on the same
     nodes, to compare with.
     """
@@ -68,7 +69,7 @@ class Swept:
 
     def _plane(self, solid: Prism) -> PlaneMesh:
         patches = solid.patches or _single_patch(solid)
-        first = self._from_patches(solid, patches) if patches else None
+        first = self._graded(solid, patches) if patches else None
         if first and first.worst() >= _GOOD_ENOUGH:
             return first
         from finqd.plugins.swept_paving import pave, pave_with_quads
@@ -82,10 +83,22 @@ class Swept:
             return first
         return first if first and first.worst() >= second.worst() else second
 
-    def _from_patches(self, solid: Prism, patches: tuple[Patch, ...]) -> PlaneMesh | None:
+    def _graded(self, solid: Prism, patches: tuple[Patch, ...]) -> PlaneMesh | None:
+        """Return the mesh of the patches, graded as far as its corners allow; paving would not be graded at all."""
+        shares = (1.0, *(_MILDER if self.grading > 1.0 else ()))
+        best = None
+        for share in shares:
+            plane = self._from_patches(solid, patches, 1.0 + share * (self.grading - 1.0))
+            if plane and (best is None or plane.worst() > best.worst()):
+                best = plane
+            if best and best.worst() >= _GOOD_ENOUGH:
+                break
+        return best
+
+    def _from_patches(self, solid: Prism, patches: tuple[Patch, ...], grading: float) -> PlaneMesh | None:
         """Return the mesh of the patches, or None if they are no partition of the profile or do not fit together."""
         try:
-            plane = mesh_patches(patches, self.size_mm * MM, self.least_edges, self.grading)
+            plane = mesh_patches(patches, self.size_mm * MM, self.least_edges, grading)
         except MeshError:
             return None
         return plane if plane.worst() > 0 and abs(plane.area() - solid.area) <= _AREA * solid.area else None

@@ -75,6 +75,8 @@ def measure(case: Case) -> Row:
         value = float(value)
     except (Failed, FinqdError, ArithmeticError) as error:
         note = str(error)
+    except Exception as error:  # of a library: the other rows count none the less
+        note = f"{type(error).__name__}: {error}"
     off = value - case.reference
     error = off if case.absolute else off / abs(case.reference)
     return Row(

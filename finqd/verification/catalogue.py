@@ -205,6 +205,9 @@ def _landing(fast: bool) -> Iterator[Case]:
                 compute=lambda: max(float(np.diff(dynamics.landing(dt, divisions)[0]).max()), 0.0))
     yield _case("landing", "soft cube: force of the floor at rest", 0.027 * dynamics.GRAVITY, "weight", 1e-3, unit="N",
                 compute=lambda: float(dynamics.landing(dt, divisions)[1].contact_forces[-1, 0]))
+    for stepper, step in product(("implicit_euler", "bdf2"), (20 * MS, 5 * MS)):
+        yield _zero("landing", f"rigid block, {stepper}, dt {step / MS:g} ms: rebound / drop",
+                    source="no restitution", band=0.001, compute=partial(dynamics.rebound, stepper, step))
 
 
 def _impact(fast: bool) -> Iterator[Case]:

@@ -142,6 +142,23 @@ def landing(
     return np.array(energy), checked(found)
 
 
+@cache
+def rebound(stepper: str, time_step: float) -> float:
+    """Return how high a rigid block rises again that falls 20 mm onto a plane, over that: implicit contact keeps none.
+
+    True of steps that are long beside the contact's own period: at 0.5 ms 0.3 % of the height are left, measured.
+    """
+    height, drop = 0.02, 0.02
+    block = load_object({"name": "block", "shape": {"kind": "box", "size_mm": [40, 40, 20]}, "mass_g": 50})
+    scene = Scene(gravity=(0.0, 0.0, -GRAVITY))
+    scene.add_plane()
+    scene.add_rigid(block, position=(0.0, 0.0, 0.5 * height + drop))
+    found = checked(simulate(scene, duration=0.25, time_step=time_step, stepper=stepper))
+    above = found.rigid_positions[:, 0, 2] - 0.5 * height
+    turn = int(np.argmax(np.diff(above) >= 0.0)) + 1  # the first moment at which it no longer falls
+    return max(float(above[turn:].max()), 0.0) / drop
+
+
 ROD = Material(youngs_modulus=1e6, poisson_ratio=0.0, density=1000.0)  # nu 0: the motion is one-dimensional
 ROD_LENGTH, ROD_SIDE, ROD_SPEED = 0.1, 0.01, 0.1
 

@@ -1,0 +1,140 @@
+"""How far off are the presets on other fingers? The press on the first finger of Sobol designs, against a finer mesh.
+
+    python benchmarks/preset_press.py --log benchmarks/preset_press.jsonl [--report] [--bands]
+
+The ladder (`finqd accuracy press`) judges presets by one finger, on which errors may cancel by luck. Here every preset
+presses the first finger of the ten designs of `verdict_flips.py`, and each force is compared with that of `YARDSTICK`,
+a mesh of quadratic bricks whose own error is told by the benchmark finger, of which the converged force is known.
+Writes a line a press as it goes, and resumes from there. ``--bands`` writes the 90 % quantile of the errors to
+studies/presets.json, which every result then carries.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from verdict_flips import designs
+
+from finqd.accuracy_log import append_row, read_rows
+from finqd.data import studies_folder
+from finqd.design import Design
+from finqd.evaluate import versions
+from finqd.presets import PRESETS, apply_preset
+from finqd.runlog import write_whole
+from finqd.verification.press import REFERENCE, press_finger
+from finqd.workers import TaskFailure, run_tasks
+
+YARDSTICK = "yardstick"
+#: settings of the yardstick over the preset `standard`
+SETTINGS = {"mesher.size_mm": 1.5, "mesher.layers": 3, "mesher.least_edges": 3, "mesher.grading": 2.0}
+QUANTILE = 90  # what a band means by an error: 90 % of fingers are nearer than that
+LIMIT_S = 1800.0
+
+Row = dict[str, Any]
+
+
+def applied(design: Design, level: str) -> Design:
+    """Return what is simulated for a preset, or for the yardstick."""
+    if level == YARDSTICK:
+        return apply_preset(design, "standard", overrides=SETTINGS)
+    return apply_preset(design, level)
+
+
+def press(task: tuple[str, str, Design]) -> Row:
+    """Press one finger; return a row of the log."""
+    name, level, design = task
+    found = press_finger(design, wall_clock_limit=LIMIT_S)
+    ok = found.status == "ok"
+    return {
+        "design": name, "level": level, "digest": design.digest(), "status": found.status, "reason": found.reason,
+        "force_N": found.force if ok else None, "dofs": found.dofs, "seconds": found.seconds, "versions": versions(),
+    }
+
+
+def run(log: Path, levels: list[str], *, jobs: int, report: bool) -> dict[tuple[str, str], Row]:
+    """Press what the log does not hold yet; return all rows by design and level."""
+    tasks = [(name, level, applied(design, level)) for name, design in designs().items() for level in levels]
+    wanted = {(name, level): design.digest() for name, level, design in tasks}
+    logged = {(row["design"], row["level"]): row for row in read_rows(log)}
+    rows = {key: row for key, row in logged.items() if row["digest"] == wanted.get(key)}
+    todo = [task for task in tasks if task[:2] not in rows]
+
+    def on_result(index: int, row: Any) -> None:
+        if isinstance(row, TaskFailure):
+            print(f"{todo[index][:2]}: {row.kind}: {row.reason}", flush=True)
+            return
+        rows[row["design"], row["level"]] = row
+        append_row(log, row)
+
+    if not report:
+        run_tasks(press, todo, jobs=jobs, on_result=on_result)
+    return rows
+
+
+def errors(rows: dict[tuple[str, str], Row], level: str) -> dict[str, float]:
+    """Return the signed errors of a level's force against the yardstick's [%], by design; of the Sobol designs."""
+    found = {}
+    for (name, one), row in rows.items():
+        exact = rows.get((name, YARDSTICK), {}).get("force_N")
+        if one == level and name != "benchmark" and exact and row["force_N"]:
+            found[name] = 100.0 * (row["force_N"] / exact - 1.0)
+    return found
+
+
+def report_rows(rows: dict[tuple[str, str], Row], levels: list[str]) -> None:
+    """Print the error of every finger by level, and their quantiles."""
+    known = rows.get(("benchmark", YARDSTICK))
+    if known is not None and known["status"] == "ok":
+        off = 100.0 * (known["force_N"] / REFERENCE - 1.0)
+        print(f"{YARDSTICK} on the benchmark finger: {known['force_N']:.4f} N, {off:+.2f} % off the converged force")
+    for level in levels[1:]:
+        found = errors(rows, level)
+        if found:
+            values = np.array(list(found.values()))
+            listed = ", ".join(f"{value:+.1f}" for value in values)
+            print(f"{level:10s} {len(values)} fingers: median {np.median(np.abs(values)):.1f} %, {QUANTILE} % below "
+                  f"{np.percentile(np.abs(values), QUANTILE):.1f} %, mean {values.mean():+.1f} %   [{listed}]")
+    for (name, level), row in rows.items():
+        if row["status"] != "ok":
+            print(f"{name}, {level}: {row['status']}: {row['reason']}")
+
+
+def write_bands(rows: dict[tuple[str, str], Row], levels: list[str]) -> None:
+    """Write the quantiles to studies/presets.json."""
+    path = studies_folder() / "presets.json"
+    document = json.loads(path.read_text())
+    document["studies"]["press_fingers"] |= {"date": time.strftime("%Y-%m-%d"), "versions": versions()}
+    for level in levels[1:]:
+        found = np.abs(list(errors(rows, level).values()))
+        document["presets"][level] |= {"press_fingers_error_percent": round(float(np.percentile(found, QUANTILE)), 2)}
+    write_whole(path, json.dumps(document, indent=2) + "\n")
+
+
+def main() -> None:
+    """Read the options, run, report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--log", type=Path, required=True)
+    parser.add_argument("--presets", default="draft,standard,fine,reference", help="paper too, if need be")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--report", action="store_true", help="only print what the log holds")
+    parser.add_argument("--bands", action="store_true", help="write the errors into studies/presets.json")
+    arguments = parser.parse_args()
+    chosen = arguments.presets.split(",")
+    if not set(chosen) <= set(PRESETS):
+        parser.error(f"--presets: known are {', '.join(PRESETS)}")
+    levels = [YARDSTICK, *chosen]
+    rows = run(arguments.log, levels, jobs=arguments.jobs, report=arguments.report)
+    report_rows(rows, levels)
+    if arguments.bands:
+        if any(len(errors(rows, level)) < len(designs()) - 1 for level in chosen):
+            parser.exit(1, "the study is not complete: no bands from this\n")
+        write_bands(rows, levels)
+
+
+if __name__ == "__main__":
+    main()
