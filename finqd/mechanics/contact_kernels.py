@@ -260,7 +260,7 @@ def _way_inside(
     """
     stride, least, limit = 0.5 * unit, begin + unit, min(limit, begin + MARCH * unit)
     x, y, u, way = np.empty(3), np.empty(3), np.empty(3), np.zeros(weights.shape[0])
-    c, w, last = np.empty(3), np.empty(3), np.empty(3)
+    c, w, last = np.empty(3), np.empty(3), np.zeros(3)  # last: read before it is first set
     share = begin + 0.5 * stride
     while share < limit:
         turned = rotation_matrix(share * spin) @ rotation
