@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 
 from finqd import cli
@@ -25,6 +27,25 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 MakeDistribution = Callable[..., None]
+
+
+@pytest.fixture(autouse=True)
+def unset_memory(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In plain Python, fill a kernel's new arrays with what overflows or is no index, if it is read before it is set.
+
+    What such memory holds is luck otherwise: a kernel that read it failed one run in many.
+    """
+    if not numba.config.DISABLE_JIT or request.node.get_closest_marker("kernel") is None:
+        return
+    empty = np.empty
+
+    def poisoned(shape: int | tuple[int, ...], dtype: object = float, **options: object) -> np.ndarray:
+        array = empty(shape, dtype, **options)
+        if array.dtype.kind in "fi":
+            array.fill(1e200 if array.dtype.kind == "f" else np.iinfo(array.dtype).max // 2)
+        return array
+
+    monkeypatch.setattr(np, "empty", poisoned)
 
 
 @pytest.fixture
