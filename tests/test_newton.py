@@ -120,3 +120,43 @@ def test_the_exact_matrix_is_tried_again_once_the_residual_has_fallen() -> None:
     assert convexity.tries(0.2) == (False, True)
     convexity.lost = True
     assert [convexity.tries(0.2)[0] for _ in range(newton.PROJECTED + 1)] == [True] * newton.PROJECTED + [False]
+
+
+def test_an_iteration_begins_with_the_projected_matrix_after_one_that_needed_it() -> None:
+    """A double well x^4/4 - x^2/2: concave about the start, convex about the minimum at 1."""
+    derivatives = SimpleNamespace(soft=np.zeros(1), rigid=np.zeros(0))
+    tried: list[bool] = []
+
+    class Well(Newton):
+        def _solve(self) -> Any:
+            curvature = derivatives.curvature
+            return SimpleNamespace(soft=-derivatives.soft / curvature, rigid=np.zeros(0), definite=curvature > 0.0)
+
+    def gradient(at: SimpleNamespace) -> float:
+        derivatives.soft = np.array([at.x**3 - at.x])
+        return float(at.x**4 / 4 - at.x**2 / 2)
+
+    def hessian(at: SimpleNamespace, *, projected: bool) -> None:
+        tried.append(projected)
+        exact = 3.0 * at.x**2 - 1.0
+        derivatives.curvature = abs(exact) if projected else exact
+
+    def state(x: float) -> SimpleNamespace:
+        return SimpleNamespace(x=x, moved=lambda direction, share=1.0: state(x + share * direction.soft[0]))
+
+    system = SimpleNamespace(derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
+    increment, report = SimpleNamespace(gradient=gradient, hessian=hessian, scale=1.0), StepReport(residuals=[])
+    well = Well(system=system, increment=increment, options=NewtonOptions(), report=report)
+    at, order = state(0.1), []
+    for _ in range(12):
+        report.residual = abs(at.x**3 - at.x)
+        tried.clear()
+        moved = well._iterate(at, gradient(at))
+        assert moved is not None
+        at = moved[0]
+        order.append(list(tried))
+        if abs(at.x - 1.0) < 1e-9:
+            break
+    assert order[0] == [False, True] and order[1] == [True], "only the projected one led downhill"
+    assert order[-1] == [False] and abs(at.x - 1.0) < 1e-9, "exact again, and quadratic, at the end"
+    assert report.projections == sum(sum(one) for one in order)
