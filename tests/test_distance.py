@@ -24,6 +24,8 @@ CONE = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.03]])
 DIMPLED = np.array([[0.0, -0.01], [0.02, -0.02], [0.02, 0.02], [0.0, 0.005]])  # cones sunk into both ends
 DIABLO = np.array([[0.0, -0.025], [0.022, -0.025], [0.008, 0.0], [0.022, 0.025], [0.0, 0.025]])
 PROFILES = {"cylinder": CYLINDER, "tube": TUBE, "cone": CONE, "dimpled": DIMPLED, "diablo": DIABLO}
+DISHED = np.array([[0.0, -0.02], [0.02, -0.02], [0.02, 0.02], [0.016, 0.02], [0.0, 0.012]])  # a bowl on top
+DISH = np.array([0.0, 0.0, 0.0, 0.02, 0.0])  # radius of the bowl
 
 
 def evaluate(field, points):
@@ -60,6 +62,7 @@ SURFACES = {"cube": cube_surface(), "tetrahedron": tetrahedron_surface(), "notch
 FIELDS = {
     "sphere": sphere_field(0.02),
     **{name: revolution_field(profile) for name, profile in PROFILES.items()},
+    "dished": revolution_field(DISHED, DISH),
     **{f"surface {name}": surface_field(*surface) for name, surface in SURFACES.items()},
     "surface of dimpled": surface_field(*turned_surface(DIMPLED, n_around=24)),
 }
@@ -132,6 +135,31 @@ def test_distance_is_one_lipschitz(name):
     a, b = cloud(seed=5), cloud(seed=6)
     change = np.abs(evaluate(FIELDS[name], a)[0] - evaluate(FIELDS[name], b)[0])
     assert np.all(change <= np.linalg.norm(a - b, axis=1) * (1 + 1e-12))
+
+
+@pytest.mark.kernel
+def test_a_side_bent_inwards_is_an_arc():
+    """A bowl of 20 mm: against the circle, and against the same bowl of 4,000 straight sides."""
+    (r0, z0), (r1, z1) = DISHED[3], DISHED[4]
+    chord = np.hypot(r1 - r0, z1 - z0)
+    normal, height = np.array([z1 - z0, r0 - r1]) / chord, np.sqrt(0.02**2 - chord**2 / 4)
+    centre = np.array([r0 + r1, z0 + z1]) / 2 + height * normal
+    begin, end = (np.arctan2(z - centre[1], r - centre[0]) for r, z in ((r0, z0), (r1, z1)))
+    angles = np.linspace(begin, end, 4000)
+    arc = centre + 0.02 * np.column_stack([np.cos(angles), np.sin(angles)])
+    arc[-1] = DISHED[4]
+    straight = revolution_field(np.concatenate([DISHED[:3], arc]))
+    points = cloud(min(N, 1000), seed=7)
+    distances, normals = evaluate(FIELDS["dished"], points)
+    other, turned = evaluate(straight, points)
+    np.testing.assert_allclose(distances, other, atol=1e-9)
+    assert np.mean(np.abs(normals - turned).max(axis=1) > 1e-3) < 0.01  # all but next to the medial axis
+    for share in (0.1, 0.5, 0.9):
+        towards = np.array([np.cos(begin + share * (end - begin)), np.sin(begin + share * (end - begin))])
+        for depth in (-0.001, 0.002):
+            found = signed_distance(FIELDS["dished"], *(centre + (0.02 - depth) * towards)[[0]], 0.0,
+                                    *(centre + (0.02 - depth) * towards)[[1]])
+            np.testing.assert_allclose(found, [depth, -towards[0], 0.0, -towards[1]], atol=1e-12)
 
 
 @pytest.mark.kernel

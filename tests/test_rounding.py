@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from shapely.geometry import Point, Polygon
 
+from finqd.mechanics.distance import revolution_field
 from finqd.mechanics.distance_kernels import distance_curvature, signed_distance
 from finqd.mechanics.rounding import rounded_field
 from finqd.object_shapes import solid_in_surface
@@ -91,6 +92,36 @@ def test_gradient_and_curvature_are_those_of_the_distance(shape: Any) -> None:
         np.testing.assert_allclose(change[:, 0], n, atol=1e-5)
         off.append(np.abs(change[:, 1:] - found).max() * RADIUS)
     assert np.sort(off)[-3] < 1e-3  # all but where a face of the smaller body ends
+
+
+def largest_turn(field: Any, start: np.ndarray, *, depth: float, step: float, count: int) -> float:
+    """Return by how much the normal turns at most [rad] from step to step, on a way ``depth`` under the surface."""
+    point, last, largest = start, None, 0.0
+    for _ in range(count):
+        d, nx, _, nz = signed_distance(field, point[0], 0.0, point[1])
+        point = point - (d + depth) * np.array([nx, nz])
+        normal = np.array(signed_distance(field, point[0], 0.0, point[1]))[[1, 3]]
+        if point[0] < 2 * step:  # the axis
+            break
+        if last is not None:
+            largest = max(largest, abs(last[0] * normal[1] - last[1] * normal[0]))
+        last, point = normal, point + step * np.array([-normal[1], normal[0]])
+    return largest
+
+
+@pytest.mark.parametrize("shape", ["diablo", "hourglass", SPOOL], ids=str)
+def test_the_normal_turns_steadily_along_a_lathe(shape: Any) -> None:
+    """Where inner arcs had flat sides, it jumped: between two of them a contact point found no equilibrium."""
+    item, depth, step = made(shape), 0.01 * MM, 0.002 * MM
+    field = rounded_field(item, RADIUS)
+    corner = item.profile[np.argmin(item.profile[:, 1] - 1e-3 * item.profile[:, 0])]
+    count = int(2.0 * np.ptp(item.profile, axis=0).sum() / step)
+    tightest = step / (RADIUS - depth)
+    assert 0.9 * tightest < largest_turn(field, corner, depth=depth, step=step, count=count) < 1.1 * tightest
+    angle = np.linspace(0.0, np.pi / 2, 65)
+    flat_sides = 0.01 * np.column_stack([1.0 - np.sin(angle), 1.0 - np.cos(angle)])
+    twin = revolution_field(np.concatenate([[[0.0, -0.01], [0.02, -0.01], [0.02, 0.0]], flat_sides]))
+    assert largest_turn(twin, np.array([0.011, 0.0]), depth=-depth, step=step, count=5000) > 5 * tightest
 
 
 def test_inside_an_edge_the_rounded_normal_turns_where_the_sharp_one_jumps() -> None:

@@ -17,23 +17,28 @@ def sphere_field(radius: float) -> DistanceField:
     return _field(kind=SPHERE, radius=float(radius))
 
 
-def revolution_field(profile: np.ndarray) -> DistanceField:
+def revolution_field(profile: np.ndarray, hollow: np.ndarray | None = None) -> DistanceField:
     """Return the field of a solid of revolution about z.
 
     profile: closed polygon (r, z) [m] with r >= 0, shape (n, 2), counterclockwise, not repeating its first point. Edges
     on the axis lie inside the solid and are left out; a profile that stays off the axis makes a ring or a tube.
+    hollow: radius [m] of the circular arc, bent inwards, that a side is, and 0 for a straight one; shape (n,).
     """
     start = np.asarray(profile, dtype=float)
     edge = np.roll(start, -1, axis=0) - start
     length = np.hypot(edge[:, 0], edge[:, 1])
     normal = np.column_stack([edge[:, 1], -edge[:, 0]]) / length[:, None]
+    radius = np.zeros(len(start)) if hollow is None else np.maximum(hollow, np.where(hollow, length / 2.0, 0.0))
+    bend = np.divide(1.0, radius, where=radius > 0.0, out=np.zeros(len(start)))
+    sine = 0.5 * bend * length  # of half the angle of an arc: its normal turns by that from the chord's to either end
+    begins, ends = (np.sqrt(1.0 - sine**2)[:, None] * normal + s * (sine / length)[:, None] * edge for s in (1, -1))
     on_axis = (start[:, 0] == 0.0) & (edge[:, 0] == 0.0)
-    mirrored = np.where(on_axis[:, None], 0.0, normal)  # an axis edge says nothing about the surface
-    at_start = mirrored + np.roll(mirrored, 1, axis=0)
+    mirrored = [np.where(on_axis[:, None], 0.0, n) for n in (begins, ends)]  # the axis says nothing about the surface
+    at_start = mirrored[0] + np.roll(mirrored[1], 1, axis=0)
     at_start[start[:, 0] == 0.0, 0] = 0.0  # an apex: its pseudonormal is along the axis
     at_start /= np.maximum(np.hypot(at_start[:, 0], at_start[:, 1]), 1e-300)[:, None]
     at_end = np.roll(at_start, -1, axis=0)
-    rows = np.column_stack([start, edge, length**-2.0, normal, at_start, at_end, np.zeros(len(start))])
+    rows = np.column_stack([start, edge, length**-2.0, normal, at_start, at_end, bend])
     return _field(kind=REVOLUTION, rows=rows[~on_axis])
 
 

@@ -19,7 +19,8 @@ TOUCHING = 1e-12  # below this distance [m] the direction to the closest point i
 #: leaf_size: triangles a leaf of the tree
 #: radius: of the sphere; of the others, how far outside the rows' surface the body's own surface lies [m]
 #: rows: of a solid of revolution, shape (n, 12), one profile segment each: start r, z, edge r, z [m], 1 / length^2
-#:     [1/m^2], outward normal r, z, unit pseudonormals r, z at its start and at its end, 0;
+#:     [1/m^2], outward normal r, z, unit pseudonormals r, z at its start and at its end, 1 / radius [1/m] if it is an
+#:     arc with its centre on the outer side (at most half a circle), 0 if it is straight;
 #:     of a surface, shape (n_slots, 12), one triangle each, in the order of the tree's leaves: corners a, b, c [m],
 #:     unit outward normal
 #: features: shape (n_slots, 6), rows of `pseudonormals` for edges ab, bc, ca and for corners a, b, c
@@ -171,19 +172,70 @@ def _surface_distance(rows, features, pseudonormals, boxes, leaf_size, x, y, z):
 
 
 @njit(cache=True, error_model="numpy")
+def _arc_centre(rows, i):
+    """Centre r, z and radius [m] of the arc i of a profile, and the height of its centre over its chord."""
+    radius = 1.0 / rows[i, 11]
+    height = np.sqrt(max(radius * radius - 0.25 / rows[i, 4], 0.0))
+    return (
+        rows[i, 0] + 0.5 * rows[i, 2] + height * rows[i, 5],
+        rows[i, 1] + 0.5 * rows[i, 3] + height * rows[i, 6],
+        radius,
+        height,
+    )
+
+
+@njit(cache=True, error_model="numpy")
 def _closest_segment(rows, r, z):
-    """Return (segment, parameter in [0, 1]) of the profile point closest to (r, z) [m]."""
+    """Return the profile segment closest to (r, z) [m] and the parameter of its closest point: 0 and 1 are its ends.
+
+    Between the ends of an arc the parameter is 0.5, whatever the point.
+    """
     best, best_segment, best_t = np.inf, 0, 0.0
     for i in range(rows.shape[0]):
         dr, dz = r - rows[i, 0], z - rows[i, 1]
         er, ez = rows[i, 2], rows[i, 3]
-        t = min(max((dr * er + dz * ez) * rows[i, 4], 0.0), 1.0)
+        t = (dr * er + dz * ez) * rows[i, 4]
+        if rows[i, 11] > 0.0:
+            cr, cz, radius, height = _arc_centre(rows, i)
+            ur, uz = r - cr, z - cz
+            length = np.sqrt(ur * ur + uz * uz)
+            if -(ur * rows[i, 5] + uz * rows[i, 6]) * radius >= length * height:  # it lies in the arc's sector
+                if (length - radius) ** 2 < best:
+                    best, best_segment, best_t = (length - radius) ** 2, i, 0.5
+                continue
+            t = 0.0 if t < 0.5 else 1.0
+        t = min(max(t, 0.0), 1.0)
         dr -= t * er
         dz -= t * ez
         distance2 = dr * dr + dz * dz
         if distance2 < best:
             best, best_segment, best_t = distance2, i, t
     return best_segment, best_t
+
+
+@njit(cache=True, error_model="numpy")
+def _profile_distance(rows, r, z):
+    """Signed distance [m] from a point (r, z) of the half plane to the profile, and its gradient r, z."""
+    i, t = _closest_segment(rows, r, z)
+    if rows[i, 11] > 0.0 and t == 0.5:
+        cr, cz, radius, _ = _arc_centre(rows, i)
+        ur, uz = cr - r, cz - z
+        length = np.sqrt(ur * ur + uz * uz)
+        if length < TOUCHING:  # in the centre all of the arc is equally near
+            return radius, rows[i, 5], rows[i, 6]
+        return radius - length, ur / length, uz / length
+    dr, dz = r - rows[i, 0] - t * rows[i, 2], z - rows[i, 1] - t * rows[i, 3]
+    if 0.0 < t < 1.0:
+        nr, nz = rows[i, 5], rows[i, 6]
+        return dr * nr + dz * nz, nr, nz
+    end = 7 if t == 0.0 else 9
+    nr, nz = rows[i, end], rows[i, end + 1]
+    d = dr * nr + dz * nz
+    length = np.sqrt(dr * dr + dz * dz)
+    if length < TOUCHING:
+        return d, nr, nz
+    d = -length if d < 0.0 else length
+    return d, dr / d, dz / d
 
 
 @njit(cache=True, error_model="numpy")
@@ -196,22 +248,28 @@ def _revolution_distance(rows, x, y, z):
     or vertex. On the axis the radial direction is taken as x.
     """
     r = np.sqrt(x * x + y * y)
-    i, t = _closest_segment(rows, r, z)
-    dr, dz = r - rows[i, 0] - t * rows[i, 2], z - rows[i, 1] - t * rows[i, 3]
-    if 0.0 < t < 1.0:
-        nr, nz = rows[i, 5], rows[i, 6]
-        d = dr * nr + dz * nz
-    else:
-        end = 7 if t == 0.0 else 9
-        nr, nz = rows[i, end], rows[i, end + 1]
-        d = dr * nr + dz * nz
-        length = np.sqrt(dr * dr + dz * dz)
-        if length >= TOUCHING:
-            d = -length if d < 0.0 else length
-            nr, nz = dr / d, dz / d
+    d, nr, nz = _profile_distance(rows, r, z)
     if r > 0.0:
         return d, nr * (x / r), nr * (y / r), nz
     return d, nr, 0.0, nz
+
+
+@njit(cache=True, error_model="numpy")
+def _profile_curvature(rows, r, z, e, nr, nz):
+    """Second derivative [1/m] of the distance across its gradient nr, nz, in the half plane; e: the distance [m].
+
+    1/e over a corner, 0 over a straight side, and -1/(R - e) over an arc of radius R that is bent inwards.
+    """
+    i, t = _closest_segment(rows, r, z)
+    if rows[i, 11] > 0.0:
+        cr, cz, radius, _ = _arc_centre(rows, i)
+        length = np.sqrt((r - cr) ** 2 + (z - cz) ** 2)
+        smooth = abs(nr * length - cr + r) + abs(nz * length - cz + z) < SAME * radius
+        if t == 0.5 or smooth:
+            return -1.0 / max(length, TOUCHING)
+    elif abs(nr - rows[i, 5]) + abs(nz - rows[i, 6]) < SAME:
+        return 0.0  # where two sides of the profile go straight on, and on the axis
+    return 1.0 / e if (t == 0.0 or t == 1.0) and e > TOUCHING else 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -253,7 +311,7 @@ def distance_curvature(field, d, x, y, z, n, out):
 
     d: the distance there [m]; n: its gradient, shape (3,). With e = d + ``radius``, the distance from the rows: 0 over
     faces, (I - n n^T - t t^T)/e over an edge along t, (I - n n^T)/e over a corner and a ball's centre; of a solid of
-    revolution, with t along the circumference, t t^T n_r/r, and over corners of the profile (t x n)(t x n)^T/e too.
+    revolution, with t along the circumference, t t^T n_r/r, and `_profile_curvature` (t x n)(t x n)^T too.
     """
     out[:] = 0.0
     e = d + field.radius
@@ -262,11 +320,8 @@ def distance_curvature(field, d, x, y, z, n, out):
         t0, t1, bend = 0.0, 1.0, 0.0
         if r > TOUCHING:
             t0, t1, bend = -y / r, x / r, (n[0] * x + n[1] * y) / (r * r)
-        i, along = _closest_segment(field.rows, r, z)
-        corner = 1.0 / e if (along == 0.0 or along == 1.0) and e > TOUCHING else 0.0
         outwards = (n[0] * x + n[1] * y) / r if r > TOUCHING else 0.0
-        if abs(outwards - field.rows[i, 5]) + abs(n[2] - field.rows[i, 6]) < SAME:
-            corner = 0.0  # where two sides of the profile go straight on, and on the axis
+        corner = _profile_curvature(field.rows, r, z, e, outwards, n[2])
         s = (t1 * n[2], -t0 * n[2], t0 * n[1] - t1 * n[0])
         t = (t0, t1, 0.0)
         for i in range(3):

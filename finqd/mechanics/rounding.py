@@ -29,6 +29,7 @@ RECESS = 4.0  # a tip may lie back by this multiple of the radius asked for
 FILL = 1.0  # and an inner edge of a lathe be filled by this multiple of the radius; beyond, it stays sharp
 MITRE = 20.0  # length of a sharp corner of a profile, in multiples of the radius, before it is cut
 ARC = 64  # pieces of a quarter circle
+ON_ARC = 1e-9  # how far a point of an arc may lie off its circle, as a share of the radius
 SHORTEST = 1e-7  # shorter sides of a profile are rounding noise [m]
 OFF = 0.05  # how far a point of the smaller body may miss its depth, as a share of the radius
 FLAT = 0.02  # share of the largest below which a direction is not held by the faces at a vertex
@@ -64,7 +65,7 @@ def _radii(radius: float) -> list[float]:
 
 def _smaller_lathes(solid: RigidShape, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
     """Yield each radius to try and the field of the lathe whose profile lies that far inside, None if too fine."""
-    from shapely import MultiPoint, Polygon, box, remove_repeated_points, union
+    from shapely import MultiPoint, Polygon, box, union
     from shapely.geometry.polygon import orient
 
     profile = solid.profile
@@ -74,18 +75,37 @@ def _smaller_lathes(solid: RigidShape, asked: float) -> Iterator[tuple[float, Di
     far = 2.0 * float(np.abs(profile).max())
     for radius in _radii(asked):
         closed = whole.buffer(radius, quad_segs=ARC)
-        inside = closed.buffer(-2.0 * radius, quad_segs=ARC)
+        inside, hollow = closed.buffer(-2.0 * radius, quad_segs=ARC), 2.0 * radius
         filled = closed.exterior.distance
         if any(filled(corner) - radius > FILL * radius and closed.contains(corner) for corner in corners):
-            inside = whole.buffer(-radius, join_style="mitre", mitre_limit=MITRE)
-        half = remove_repeated_points(inside.intersection(box(0.0, -far, far, far)), SHORTEST)
+            inside, hollow = whole.buffer(-radius, join_style="mitre", mitre_limit=MITRE), 0.0
+        half = inside.intersection(box(0.0, -far, far, far))
         found = None
         simple = half.geom_type == "Polygon" and not half.is_empty and not half.interiors
         if simple and all(half.distance(corner) <= radius + RECESS * asked for corner in corners):
             points = np.array(orient(half, 1.0).exterior.coords)[:-1]
             points[np.abs(points[:, 0]) < 1e-12, 0] = 0.0
-            found = revolution_field(points)
+            centres = np.concatenate([np.array(ring.coords)[:-1] for ring in (closed.exterior, *closed.interiors)])
+            found = revolution_field(*_with_arcs(points, centres, hollow))
         yield radius, found
+
+
+def _with_arcs(points: np.ndarray, centres: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a profile in which runs of sides on circles about ``centres`` are one side each, and the sides' radii [m].
+
+    Between the flat sides of an inner arc the normal would jump: a sample that lies there has no equilibrium that
+    Newton's method finds. ``radius`` [m]: of the circles; 0, which the sides' radii are if they are straight: no arcs.
+    """
+    n = len(points)
+    arc = np.full(n, -1)
+    if radius > 0.0:
+        on = np.abs(np.linalg.norm(points[:, None] - centres, axis=2) - radius) <= ON_ARC * radius
+        side = on & np.roll(on, -1, axis=0)
+        arc = np.where(side.any(axis=1), side.argmax(axis=1), -1)
+    starts = (arc < 0) | (arc != np.roll(arc, 1))
+    points, arc = points[starts], arc[starts]
+    long = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1) > SHORTEST
+    return points[long], np.where(arc[long] >= 0, radius, 0.0)
 
 
 def _smaller_surfaces(solid: RigidShape, asked: float) -> Iterator[tuple[float, DistanceField | None]]:
