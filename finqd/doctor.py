@@ -5,11 +5,9 @@ from __future__ import annotations
 import os
 import platform
 import sys
-import tempfile
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any, Literal
 
 from finqd.errors import MissingLibraryError
@@ -131,18 +129,14 @@ def _memory() -> Finding:
 
 
 def _kernel_cache() -> Finding:
-    """Look for a folder in which compiled kernels can stay, in the order in which Numba looks."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    folders = [Path(chosen)] if chosen else [Path(__file__).parent / "mechanics", Path.home() / ".cache" / "numba"]
-    for folder in folders:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                return Finding("kernel cache", "ok", f"{folder} is writable: kernels compile once")
-        except OSError:
-            continue
-    return Finding("kernel cache", "missing",
-                   f"{folders[-1]} is not writable, so kernels would compile in every process; set NUMBA_CACHE_DIR")
+    """Look for a folder in which compiled kernels can stay."""
+    from finqd.mechanics.compiled import kernel_folder, kernel_places
+
+    folder = kernel_folder()
+    if folder is not None:
+        return Finding("kernel cache", "ok", f"{folder.parent} is writable: kernels compile once")
+    return Finding("kernel cache", "missing", f"{kernel_places()[-1]} is not writable, so kernels would compile in "
+                   "every process; set NUMBA_CACHE_DIR")
 
 
 def _bundled_files() -> Finding:

@@ -1,7 +1,8 @@
 """Kernels on block matrices in the format of `finqd.mechanics.pattern`."""
 
 import numpy as np
-from numba import njit
+
+from finqd.mechanics.compiled import njit
 
 
 @njit(cache=True)

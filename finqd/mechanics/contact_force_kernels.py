@@ -6,8 +6,8 @@ Relative displacement of a contact: w = sum_a weight_a dx_a - dc - dphi x arm, s
 import math
 
 import numpy as np
-from numba import njit
 
+from finqd.mechanics.compiled import njit
 from finqd.mechanics.contact_kernels import face_point
 
 

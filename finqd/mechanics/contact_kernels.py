@@ -13,8 +13,8 @@ Relative displacement of a contact: w = sum_a weight_a dx_a - dc - dphi x arm, s
 import math
 
 import numpy as np
-from numba import njit
 
+from finqd.mechanics.compiled import njit
 from finqd.mechanics.distance_kernels import distance_curvature, signed_distance
 from finqd.mechanics.rotation_kernels import rotation_matrix
 

@@ -22,8 +22,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from finqd.mechanics.compiled import njit
 from finqd.mechanics.polar_kernels import closest_rotation, symmetric_eigen
 
 SINGULAR = 1e-6  # smallest s_i + s_j [-] of an element's stretch at which its rotation still has a derivative

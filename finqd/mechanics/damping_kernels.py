@@ -1,8 +1,8 @@
 """Kernels of damping; what resists strain rates is done by `finqd.mechanics.corotated_kernels`."""
 
 import numpy as np
-from numba import njit
 
+from finqd.mechanics.compiled import njit
 from finqd.mechanics.corotated_kernels import strained
 
 

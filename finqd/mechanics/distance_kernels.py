@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
+
+from finqd.mechanics.compiled import njit
 
 SPHERE, REVOLUTION, SURFACE = 0, 1, 2
 SAME = 1e-9  # normals that differ by less are one

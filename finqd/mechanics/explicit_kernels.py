@@ -1,7 +1,8 @@
 """Kernels of explicit steps."""
 
 import numpy as np
-from numba import njit
+
+from finqd.mechanics.compiled import njit
 
 
 @njit(cache=True)

@@ -5,7 +5,7 @@ All run serially in a fixed order, so that the same input gives the same bits wh
 
 from __future__ import annotations
 
-from numba import njit
+from finqd.mechanics.compiled import njit
 
 
 @njit(cache=True)

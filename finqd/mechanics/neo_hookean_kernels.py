@@ -28,8 +28,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from finqd.mechanics.compiled import njit
 from finqd.mechanics.condensation_kernels import condense, make_semidefinite, newton_step
 from finqd.mechanics.polar_kernels import closest_rotation
 
