@@ -46,6 +46,7 @@ DESIGNS = 10
 REFERENCE_PAIRS = 20
 ESTIMATED = 5  # every so manieth grasp is estimated, whatever its verdict
 SUITES = ("fine", "reference", "paper")
+LEAST_PAIRS = 20  # fewer say nothing of shares
 FIRM_N = 0.5  # [N] relative errors of smaller forces say nothing
 QUANTILE = 90  # what the bands in studies/presets.json mean by an error: 90 % of grasps are nearer than that
 
@@ -276,8 +277,8 @@ def report_errors(found: list[tuple[Pair, dict, dict]]) -> None:
         print(f"  the estimate costs {extra / max(base, 1e-9):.2f} times the grasp itself")
 
 
-def write_bands(preset: str, found: list[tuple[Pair, dict, dict]]) -> None:
-    """Write what the suite `fine` found of ``preset`` to studies/presets.json, which every result then carries."""
+def write_bands(preset: str, suite: str, found: list[tuple[Pair, dict, dict]]) -> None:
+    """Write what a suite found of ``preset`` to studies/presets.json, which every result then carries."""
     path = studies_folder() / "presets.json"
     document = json.loads(path.read_text())
     force, drop = (np.percentile([error for error, *_ in errors], QUANTILE) for *_, errors in held_by_both(found))
@@ -287,6 +288,7 @@ def write_bands(preset: str, found: list[tuple[Pair, dict, dict]]) -> None:
         "settings": PRESETS[preset], "grasp_force_error_percent": round(float(force), 2),
         "drop_error_mm": round(float(drop), 3), "verdict_flips_percent": round(100 * flips / len(found), 1),
         "grasp_seconds": round(float(np.median([ours["seconds"] for _, ours, _ in found])), 1),
+        "grasps_compared": f"{len(found)} grasps against {suite}",
     }
     write_whole(path, json.dumps(document, indent=2) + "\n")
 
@@ -321,11 +323,11 @@ def main() -> None:
     rows = run(arguments, wanted)
     report(wanted, rows)
     if arguments.bands:
-        found = list(done(wanted, "fine", rows))
-        made = [pair for pair in wanted if pair.suite == "fine" and {pair.ours, pair.other} <= rows.keys()]
-        if len(made) < sum(pair.suite == "fine" for pair in wanted) or arguments.pairs:
-            parser.exit(1, "the suite fine is not complete: no bands from this\n")
-        write_bands(arguments.preset, found)
+        suite = "fine" if arguments.preset != "fine" else "reference"
+        mine = [pair for pair in wanted if pair.suite == suite]
+        if len(mine) < LEAST_PAIRS or any(not {pair.ours, pair.other} <= rows.keys() for pair in mine):
+            parser.exit(1, f"not all pairs of the suite {suite} are there, or less than {LEAST_PAIRS}: no bands\n")
+        write_bands(arguments.preset, suite, list(done(wanted, suite, rows)))
 
 
 if __name__ == "__main__":

@@ -38,7 +38,8 @@ def accuracy(design: Design, preset: str) -> dict[str, Any]:
     objection = _unmeasured(preset, numbers) or _objection(design, preset, file["valid_for"])
     studies = {MEASURED[key] for key, value in numbers.items() if value is not None}
     return {
-        "preset": preset, "applies": objection is None, "sentence": objection or _summary(numbers), **numbers,
+        "preset": preset, "applies": objection is None, "sentence": objection or _summary(preset, numbers), **numbers,
+        "grasps_compared": _compared(preset),
         "studies": {name: dict(file["studies"][name]) for name in sorted(studies)},
     }
 
@@ -52,7 +53,7 @@ def measured(preset: str) -> dict[str, float | None]:
 def preset_sentence(preset: str) -> str:
     """Return what is measured of a preset where it is used as it is, in one sentence."""
     numbers = measured(preset)
-    return _unmeasured(preset, numbers) or _summary(numbers)
+    return _unmeasured(preset, numbers) or _summary(preset, numbers)
 
 
 @lru_cache(maxsize=1)
@@ -87,7 +88,12 @@ def _objection(design: Design, preset: str, valid_for: Mapping[str, Any]) -> str
     return f"does not apply: {'; '.join(found)}" if found else None
 
 
-def _summary(numbers: Mapping[str, Any]) -> str:
+def _compared(preset: str) -> str | None:
+    """Return how many grasps the preset was compared in, and with what; None if in none."""
+    return bands()["presets"].get(preset, {}).get("grasps_compared")
+
+
+def _summary(preset: str, numbers: Mapping[str, Any]) -> str:
     """Return the measured errors as one sentence."""
     parts = [
         text.format(numbers[key])
@@ -100,4 +106,5 @@ def _summary(numbers: Mapping[str, Any]) -> str:
         )
         if numbers[key] is not None
     ]
-    return ", ".join(parts) or "only its seconds have been measured"
+    compared = _compared(preset)
+    return ", ".join(parts) + (f" ({compared})" if compared else "") or "only its seconds have been measured"

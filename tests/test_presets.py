@@ -135,6 +135,13 @@ def test_a_measured_preset_says_how_far_off_it_is_and_from_which_studies(studied
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
+def test_it_says_how_many_grasps_were_compared_and_with_what(studied):
+    studied["presets"]["standard"]["grasps_compared"] = "100 grasps against fine"
+    found = measured()
+    assert found["sentence"].endswith("2 % of verdicts flip (100 grasps against fine)")
+    assert found["grasps_compared"] == "100 grasps against fine"
+
+
 def test_what_no_study_has_measured_is_named_by_none(studied):
     studied["presets"]["standard"]["verdict_flips_percent"] = None
     assert measured()["studies"].keys() == {"press", "press_fingers"}
@@ -177,7 +184,8 @@ def test_the_file_that_ships_knows_every_preset_and_claims_only_what_names_its_s
     file = bands()
     assert file["presets"].keys() == PRESETS.keys()
     for name, row in file["presets"].items():
-        assert row.keys() == {"settings", *MEASURED}, name
+        assert row.keys() - {"grasps_compared"} == {"settings", *MEASURED}, name
+        assert ("grasps_compared" in row) == (row["verdict_flips_percent"] is not None), name
         known = [key for key in MEASURED if row[key] is not None]
         assert all(isinstance(row[key], float | int) and row[key] >= 0 for key in known), name
         assert not known or row["settings"] == PRESETS[name], f"{name} has changed: measure it again"
