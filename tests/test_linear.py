@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from finqd.errors import InputError
 from finqd.mechanics.linear import make_solver
-from finqd.mechanics.linear_backends import Rows, available_backends, create_factorisation
+from finqd.mechanics.linear_backends import QdldlFactorisation, Rows, available_backends, create_factorisation
 from finqd.mechanics.linear_kernels import coupled_product, dot, subtract_product, transposed_product
 from finqd.mechanics.pattern import BlockPattern
 
@@ -156,7 +156,7 @@ def test_a_lagged_preconditioner_serves_a_changed_system(backend):
     system = System(7, bodies=1)
     solver = make_solver(system.pattern, backend=backend, tolerance=1e-9, refactor_cost=20.0)
     first = system.solve(solver)
-    assert first.factorised and first.iterations == 1
+    assert first.factorised and first.iterations <= 2  # in single precision one more
     system.blocks *= 1.05
     system.add(10.0 * np.outer(_contact(system, 20), _contact(system, 20)), 20)
     second = system.solve(solver)
@@ -176,10 +176,84 @@ def test_a_useless_preconditioner_is_replaced_in_the_same_solve():
     solver = make_solver(first.pattern, tolerance=1e-10, refactor_cost=6.0)
     first.solve(solver)
     solution = second.solve(solver)
-    assert solution.factorised and solution.iterations == 7 and solution.converged
+    assert solution.factorised and solution.iterations in (7, 8) and solution.converged
     assert error(solution, second.exact) < 1e-8
     again = second.solve(solver)
-    assert not again.factorised and again.iterations == 1
+    assert not again.factorised and again.iterations <= 2
+
+
+class Rounded(QdldlFactorisation):
+    """A factorisation in single precision for machines without a library that has one: all that goes in is rounded."""
+
+    single = True
+
+    def factorise(self, blocks):
+        return super().factorise(blocks.astype(np.float32).astype(float))
+
+    def solve(self, rhs):
+        return super().solve(rhs.astype(np.float32).astype(float)).astype(np.float32).astype(float)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Let solvers begin in single precision on every machine; return the precision of what they make, in turn."""
+    made = []
+
+    def create(backend, pattern, *, single=False):
+        made.append("single" if single else "double")
+        return (Rounded if single else QdldlFactorisation)(pattern)
+
+    monkeypatch.setattr("finqd.mechanics.linear.create_factorisation", create)
+    return made
+
+
+def _chain(stiffness: float) -> System:
+    """Return a system of springs along a chain, held at its start, of condition about ``stiffness``."""
+    system = System(1, bodies=0, vertices=40)
+    system.blocks[:] = 0.0
+    n = system.pattern.n_vertices
+    for i in range(n - 1):
+        slot = system.pattern.slots(np.array([[i, i + 1]]))[0]
+        for a in range(2):
+            for b in range(a, 2):
+                system.blocks[slot[a, b]] += (1.0 if a == b else -1.0) * np.eye(3) * stiffness / n**2
+    system.blocks[system.pattern.indptr[:-1]] += 1e-3 * np.eye(3)
+    return system
+
+
+def test_a_well_conditioned_system_is_served_in_single_precision(made):
+    system = System(7, bodies=1)
+    solver = make_solver(system.pattern, tolerance=1e-10)
+    for _ in range(3):
+        solver.forget()
+        solution = system.solve(solver)
+        assert solution.factorised and solution.converged and 1 < solution.iterations <= 4
+        assert error(solution, system.exact) < 1e-8
+    assert made == ["single"]
+
+
+def test_what_single_precision_cannot_tell_from_indefinite_is_factorised_in_double(made):
+    system = _chain(1e9)
+    assert np.linalg.eigvalsh(system.dense)[0] > 0.0
+    rounded = system.blocks.astype(np.float32).astype(float)
+    assert np.linalg.eigvalsh(system.pattern.matrix(rounded).toarray())[0] < 0.0, "not as hard as it is meant to be"
+    solution = system.solve(make_solver(system.pattern, tolerance=1e-8))
+    assert solution.definite and solution.converged and made == ["single", "double"]
+    assert error(solution, system.exact) < 1e-5
+
+
+def test_an_indefinite_system_is_no_reason_for_double_precision_unless_it_lasts(made):
+    good, bad = System(3, bodies=1), System(3, bodies=1, shift=30.0)
+    solver = make_solver(good.pattern, tolerance=1e-8)
+    for system, definite in ((good, True), (bad, False), (good, True), (bad, False)):
+        solver.forget()
+        assert system.solve(solver).definite == definite
+    assert made == ["single"]
+    solver.forget()
+    assert not bad.solve(solver).definite
+    assert made == ["single", "double"]
+    solver.forget()
+    assert good.solve(solver).converged
 
 
 @pytest.mark.parametrize("cost", [1.0, 5.0, 20.0, 200.0])

@@ -40,7 +40,7 @@ PRECONDITIONERS = ("factorisation", "block_jacobi", "jacobi")
 _DIRECT_TOLERANCE = 1e-6
 #: smallest eigenvalue of a scaled Schur complement, as a share of the largest, that is told from zero
 _SINGULAR = 1e-14
-#: iterations that a lagged inverse is always granted
+#: iterations that a lagged inverse is always granted, and one in single precision when it is new
 _FEWEST = 4
 
 
@@ -261,7 +261,8 @@ class LinearSolver:
         self.tolerance, self.max_iterations, self.refactor_cost = tolerance, max_iterations, refactor_cost
         self._factorisation: Factorisation | None = None
         if method == "direct" or preconditioner == "factorisation":
-            self._factorisation = create_factorisation(backend, pattern)
+            self._factorisation = create_factorisation(backend, pattern, single=method == "cg")
+        self._backend, self._served = backend, False  # whether the last factor in single precision was of use
         self._lagged: CoupledInverse | None = None
         self._refactor_cost, self._spent, self._solved = 0.0, 0, 0  # since the lagged inverse was made, in iterations
 
@@ -326,9 +327,8 @@ class LinearSolver:
 
     def _direct(self, matrix: CoupledMatrix, rhs: np.ndarray) -> tuple[_Iterate, bool]:
         assert self._factorisation is not None
-        try:
-            inverse = CoupledInverse(self._factorisation, matrix)
-        except np.linalg.LinAlgError:
+        inverse = _inverse_of(self._factorisation, matrix)
+        if inverse is None:
             self._lagged = None
             return _Iterate(np.zeros(len(rhs)), definite=False), True
         self._lagged = inverse if inverse.positive else None  # for quasi-Newton steps
@@ -351,23 +351,44 @@ class LinearSolver:
                 self._lagged = None
             if not state.definite or state.converged:
                 return state, False
-        assert self._factorisation is not None
         self._lagged, wasted = None, state.iterations
-        try:
-            inverse = CoupledInverse(self._factorisation, matrix)
-        except np.linalg.LinAlgError:
-            state.definite = False
-            return state, True
-        state = _solve_directly(matrix, inverse, rhs)
-        if inverse.positive:
-            self._lagged, self._spent, self._solved = inverse, 1, 1
-            self._refactor_cost = self._cost_of(matrix)
-            if not state.converged:
-                state = conjugate_gradients(
-                    matrix, inverse, rhs, tolerance=tolerance, max_iterations=self.max_iterations
-                )
+        state = self._renewed_cg(matrix, rhs, tolerance)
         state.iterations += wasted
         return state, True
+
+    def _renewed_cg(self, matrix: CoupledMatrix, rhs: np.ndarray, tolerance: float) -> _Iterate:
+        """Solve with a new inverse, which is kept; in single precision while that serves.
+
+        A preconditioner need not be exact. But rounding can make a matrix seem indefinite: if that happens to the first
+        one or twice in a row, or iterations do not get on, the matrices are too ill conditioned, and from then on all
+        are factorised in double precision.
+        """
+        assert self._factorisation is not None
+        single = self._factorisation.single
+        inverse = _inverse_of(self._factorisation, matrix)
+        positive = inverse is not None and inverse.positive
+        served, self._served = self._served, positive
+        if inverse is None or not positive:
+            if single and not served:
+                return self._precise_cg(matrix, rhs, tolerance)
+            if inverse is None:
+                return _Iterate(np.zeros(len(rhs)), definite=False)
+            return _solve_directly(matrix, inverse, rhs)
+        self._lagged, self._spent, self._solved = inverse, 1, 1
+        self._refactor_cost = self._cost_of(matrix)
+        if single:
+            state = conjugate_gradients(matrix, inverse, rhs, tolerance=tolerance, max_iterations=_FEWEST)
+            return state if state.converged else self._precise_cg(matrix, rhs, tolerance)
+        state = _solve_directly(matrix, inverse, rhs)
+        if state.converged:
+            return state
+        return conjugate_gradients(matrix, inverse, rhs, tolerance=tolerance, max_iterations=self.max_iterations)
+
+    def _precise_cg(self, matrix: CoupledMatrix, rhs: np.ndarray, tolerance: float) -> _Iterate:
+        """Go over to double precision for good."""
+        self._lagged = None
+        self._factorisation = create_factorisation(self._backend, self.pattern)
+        return self._renewed_cg(matrix, rhs, tolerance)
 
     def _cost_of(self, matrix: CoupledMatrix) -> float:
         """Return what a new inverse costs, in iterations."""
@@ -376,6 +397,14 @@ class LinearSolver:
         assert self._factorisation is not None
         column = self._factorisation.factor_entries / max(len(matrix.coupling), 1)
         return self._factorisation.factor_cost * column + self._factorisation.column_cost * len(matrix.rigid)
+
+
+def _inverse_of(factorisation: Factorisation, matrix: CoupledMatrix) -> CoupledInverse | None:
+    """Return the inverse of ``matrix``, None if it is singular or indefinite and the library stops there."""
+    try:
+        return CoupledInverse(factorisation, matrix)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _solve_directly(matrix: CoupledMatrix, inverse: CoupledInverse, rhs: np.ndarray) -> _Iterate:
