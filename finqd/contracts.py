@@ -6,8 +6,8 @@ first line is what ``finqd plugins`` prints. It is registered under the entry-po
 and named in a design file: ``"mesher": {"name": "swept", "size_mm": 4}`` or just ``"mesher": "swept"``.
 
 Everything that passes between plugins is SI and is one of the plain data classes named here. A plugin imports
-``finqd.*`` but never another plugin. Compiled kernels take ``njit`` from ``finqd.mechanics.compiled``: Numba's own would not
-notice when an update changes a kernel of finqd's that they call.
+``finqd.*`` but never another plugin. Compiled kernels take ``njit`` from ``finqd.mechanics.compiled``: Numba's own
+would miss that a kernel of finqd's which they call has changed with an update.
 
 The finger frame, which geometry, meshers and actuation share: the origin lies on the inner (contact side) edge of the
 finger's base; x points away from the gripper's axis, y from the base towards the tip, z along the
