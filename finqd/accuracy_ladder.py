@@ -36,7 +36,7 @@ _TET4: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 1}
 _TET10: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 2}
 #: in full: what a rung leaves open, the preset fills with its own options
 _HEX8: dict[str, Any] = {
-    "mesher": "swept", "mesher.order": 1, "mesher.layers": None, "mesher.notch_nodes": "middle",
+    "mesher": "swept", "mesher.order": 1, "mesher.layers": None, "mesher.notch_nodes": "middle", "mesher.grading": 1.0,
 }
 _HEX20: dict[str, Any] = {**_HEX8, "mesher.order": 2}
 _QUARTER: dict[str, Any] = {**_HEX20, "mesher.layers": 2, "mesher.notch_nodes": "quarter"}
@@ -188,8 +188,8 @@ def _all_rungs() -> list[Rung]:
 def _sizes() -> list[Rung]:
     graded = {**_QUARTER, "mesher.grading": 1.5}
     families: tuple[tuple[str, str, dict[str, Any], Sequence[float]], ...] = (
-        ("size", "hex20, quarter nodes", _QUARTER, (6, 4, 3, 2.5, 2, 1.5)),
-        ("element", "hex20, quarter nodes, graded", graded, (6, 4, 3, 2.5, 2, 1.5)),
+        ("size", "hex20, quarter nodes, graded", graded, (6, 4, 3, 2.5, 2, 1.5)),
+        ("element", "hex20, quarter nodes", _QUARTER, (6, 4, 3, 2.5, 2, 1.5)),
         ("element", "hex20", _HEX20, (8, 6, 4, 3, 2)), ("element", "hex8", _HEX8, (8, 6, 4, 3, 2, 1.5, 1)),
         ("element", "tet10", _TET10, (8, 6, 4, 3, 2, 1.5)), ("element", "tet4", _TET4, (6, 4, 3, 2, 1.5, 1)),
         ("element", "hex8, two through a wall", {**_HEX8, "mesher.least_edges": 2}, (6, 4, 3, 2)),
@@ -199,8 +199,8 @@ def _sizes() -> list[Rung]:
         for knob, family, settings, sizes in families for size in sizes
     ]
     layers = [
-        _rung("element", f"layers of {size:g} mm", f"hex20, quarter nodes {size:g} mm, {n} layers",
-              {**_QUARTER, "mesher.size_mm": size, "mesher.layers": n})
+        _rung("element", f"layers of {size:g} mm", f"hex20, quarter nodes, graded {size:g} mm, {n} layers",
+              {**graded, "mesher.size_mm": size, "mesher.layers": n})
         for size in (2.5, 4.0) for n in (1, 2, 3, 4) if (size, n) not in ((2.5, 2), (4.0, 2))
     ]
     known = {"swept", "tetrahedral"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,12 +15,17 @@ if TYPE_CHECKING:
 DPI = 130
 INK, SOFT, FRONT, PRESET = "#222222", "#999999", "#111111", "#c1121f"
 #: element families have colours of their own; else a colour says what is turned, and a mark which of several it is
-FAMILIES = {"size of tet4": "#d62828", "size of tet10": "#e07a1f", "size of hex20": "#0b3c8c"}
+FAMILIES = {
+    "size of tet4": "#d62828", "size of tet10": "#e07a1f", "size of hex8": "#2a9d4a",
+    "size of hex8, two through a wall": "#8cc63f", "size of hex20": "#0b3c8c",
+    "size of hex20, quarter nodes": "#1f8bb0", "size of hex20, quarter nodes, graded": "#000000",
+}
 COLOURS = {
-    "size": "#1f6f8b", "element": "#e07a1f", "step": "#2a9d4a", "adaptive": "#7fbf3f", "stepper": "#8e5bb5",
+    "size": "#1f6f8b", "element": "#9a7b4f", "step": "#7fbf9a", "adaptive": "#5aa05a", "stepper": "#8e5bb5",
     "newton": "#b58b00", "linear": "#5c7fd6", "contact": "#d1699b", "elasticity": "#7a5230",
 }
 MARKS = "osD^vP<>hX*pd"
+LABEL_WIDTH, LABEL_HEIGHT = 5.6, 26.0  # of a letter, and of a label's two lines [points]
 
 
 def draw(study: Study, path: Path) -> None:
@@ -43,6 +49,7 @@ def draw(study: Study, path: Path) -> None:
     if marked:
         axes.plot(*zip(*marked), linestyle="")  # makes room for them
     _dress(axes, study)
+    figure.draw_without_rendering()  # labels are placed where the points are, once the layout is done
     _mark_presets(axes, {row["rung"]: row for row in rows if row["knob"] == "preset"}, lowest)
     figure.savefig(path, dpi=DPI)
 
@@ -77,20 +84,40 @@ def _lowest(study: Study, rows: Sequence[Row]) -> float:
 
 
 def _mark_presets(axes: Axes, presets: Mapping[str, Row], lowest: float) -> None:
-    above = True
-    low, high = axes.get_ylim()
-    for name, row in sorted(presets.items(), key=lambda item: item[1]["seconds"]):
-        point = (row["seconds"], max(abs(row["error_percent"]), lowest))
-        above = above or point[1] < low * (high / low) ** 0.15  # there is no room below
-        text = "the paper's setting" if name == "paper" else name
-        told = f"{text}\n{abs(row['error_percent']):.2g} %, {row['seconds']:.2g} s"
+    """Mark each preset by a star and a label, which lies where it covers no star and no other label."""
+    taken: list[tuple[float, float, float, float]] = []
+    points = {
+        name: (row["seconds"], max(abs(row["error_percent"]), lowest))
+        for name, row in sorted(presets.items(), key=lambda item: item[1]["seconds"])
+    }
+    seen = {name: axes.transData.transform(point) * 72.0 / axes.figure.dpi for name, point in points.items()}
+    taken += [(x - 9, y - 9, x + 9, y + 9) for x, y in seen.values()]
+    for name, point in points.items():
         axes.plot(*point, marker="*", markersize=17, color=PRESET, markeredgecolor="white", linestyle="", zorder=9)
+        text = "the paper's setting" if name == "paper" else name
+        error = abs(presets[name]["error_percent"])
+        told = f"{text}\n{error:.{3 if error >= 100.0 else 2}g} %, {presets[name]['seconds']:.2g} s"
+        shift, box = _free_place(seen[name], LABEL_WIDTH * max(map(len, told.split("\n"))), taken)
+        taken.append(box)
         axes.annotate(
-            told, point, xytext=(0, 16 if above else -16), textcoords="offset points", ha="center",
-            va="bottom" if above else "top", fontsize=9.5, fontweight="bold", color=PRESET, zorder=10,
+            told, point, xytext=shift, textcoords="offset points", ha="center", va="center", fontsize=9.5,
+            fontweight="bold", color=PRESET, zorder=10, arrowprops={"arrowstyle": "-", "color": PRESET, "lw": 0.8},
             bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0},
         )
-        above = not above
+
+
+def _free_place(
+    point: Sequence[float], width: float, taken: Sequence[tuple[float, float, float, float]]
+) -> tuple[tuple[float, float], tuple[float, float, float, float]]:
+    """Return how far from ``point`` the middle of a label lies that covers nothing, and its box; all in points."""
+    angles = [math.pi * share for share in (0.5, -0.5, -0.1, 0.1, 0.9, 1.1)]
+    places = [(1.6 * far * math.cos(a), far * math.sin(a)) for far in range(32, 240, 12) for a in angles]
+    centres = [(point[0] + dx, point[1] + dy) for dx, dy in places]
+    across, up = 0.5 * width, 0.5 * LABEL_HEIGHT
+    boxes = [(x - across, y - up, x + across, y + up) for x, y in centres]
+    clear = [all(b[0] > t[2] or b[2] < t[0] or b[1] > t[3] or b[3] < t[1] for t in taken) for b in boxes]
+    best = clear.index(True) if True in clear else 0
+    return places[best], boxes[best]
 
 
 def _dress(axes: Axes, study: Study) -> None:
@@ -105,12 +132,13 @@ def _dress(axes: Axes, study: Study) -> None:
     axes.set_ylabel(f"error of the {quantity.label} [%]", color=INK)
     axes.set_title(f"{study.case.title}: {study.design.name}", fontsize=12, color=INK)
     if study.reference and study.reference.uncertainty_percent > 0.0:
-        axes.axhspan(1e-9, study.reference.uncertainty_percent, color=SOFT, alpha=0.18, zorder=0)
+        low, high = axes.get_ylim()
+        low = min(low, 0.2 * study.reference.uncertainty_percent)
+        axes.axhspan(low, study.reference.uncertainty_percent, color=SOFT, alpha=0.18, zorder=0)
         axes.text(
             0.995, study.reference.uncertainty_percent, "the reference is no surer than this ", fontsize=8.5,
             color=INK, ha="right", va="top", transform=axes.get_yaxis_transform(),
         )
-        low, high = axes.get_ylim()
         axes.set_ylim(max(low, 0.2 * study.reference.uncertainty_percent), high)
     axes.grid(which="major", color="#dddddd", linewidth=0.7)
     axes.grid(which="minor", color="#eeeeee", linewidth=0.4)

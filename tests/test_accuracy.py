@@ -35,6 +35,7 @@ from finqd.accuracy_ladder import (
     without_numerics,
 )
 from finqd.accuracy_log import append_row, read_rows
+from finqd.accuracy_plot import _free_place
 from finqd.accuracy_reference import (
     error_of,
     extrapolated,
@@ -134,6 +135,15 @@ def test_a_curve_contains_standard_itself(design):
     assert {rung.name for rung in ladder.rungs if rung.knob == "preset"} == set(PRESETS)
 
 
+def test_no_two_rungs_of_element_families_compute_the_same(design):
+    """What a family leaves open the preset would fill: all of them were graded once, because `standard` is."""
+    ladder = build_ladder(design)
+    digests: dict[str, str] = {}
+    for rung in ladder.rungs:
+        if rung.series.startswith("size of"):
+            assert digests.setdefault(ladder.designs[rung.name].digest(), rung.name) == rung.name
+
+
 def test_what_is_not_installed_is_named_with_its_reason(design, monkeypatch):
     rungs = [
         Rung(name="standard", knob="preset", series="preset"),
@@ -225,11 +235,11 @@ def test_a_row_says_what_was_run_and_with_what(study_in, tmp_path):
     study.run([rung for rung in study.rungs if rung.name == "hex8 2 mm"])
     row = read_rows(tmp_path / LOG)[-1]
     settings = {"mesher": "swept", "mesher.order": 1, "mesher.layers": None, "mesher.notch_nodes": "middle"}
-    assert row["settings"] == {**settings, "mesher.size_mm": 2} and row["knob"] == "element"
+    assert row["settings"] == {**settings, "mesher.grading": 1.0, "mesher.size_mm": 2} and row["knob"] == "element"
     assert row["versions"]["finqd"] and row["machine"]["cores"] >= 1 and row["status"] == "ok"
     assert row["options"] == (
         "--preset standard --set mesher=swept --set mesher.order=1 --set mesher.layers=null "
-        "--set mesher.notch_nodes=middle --set mesher.size_mm=2"
+        "--set mesher.notch_nodes=middle --set mesher.grading=1 --set mesher.size_mm=2"
     )
     assert row["design_digest"] == study.runner.ran[-1].digest() != study.design.digest()
     exact = study.reference.values["force_N"]
@@ -544,6 +554,16 @@ def test_table_picture_and_page(study_in, tmp_path):
         assert needed in text, needed
 
 
+def test_labels_of_presets_cover_neither_stars_nor_each_other():
+    stars = [(100.0 + 9.0 * i, 100.0) for i in range(5)]
+    taken = [(x - 9.0, y - 9.0, x + 9.0, y + 9.0) for x, y in stars]
+    for star in stars:
+        (dx, dy), box = _free_place(star, 80.0, taken)
+        assert box == pytest.approx((star[0] + dx - 40, star[1] + dy - 13, star[0] + dx + 40, star[1] + dy + 13))
+        assert all(box[0] > b[2] or box[2] < b[0] or box[1] > b[3] or box[3] < b[1] for b in taken)
+        taken.append(box)
+
+
 def test_a_picture_without_any_error_can_be_drawn(study_in, tmp_path):
     study = study_in(tmp_path, knobs=["linear"])
     assert "nothing" not in page(study, picture=b"")
@@ -588,13 +608,13 @@ def test_the_command_runs_a_ladder_and_answers_from_it(run, tmp_path, monkeypatc
     monkeypatch.setattr("finqd.accuracy.open_study", without_processes)
     command = ["accuracy", "--reference", "compute", "--out", tmp_path, "--knob", "size"]
     code, out, said = run(*command)
-    assert code == 0 and "hex20, quarter nodes 2 mm" in out and "on the Pareto front" in out
+    assert code == 0 and "hex20, quarter nodes, graded 2 mm" in out and "on the Pareto front" in out
     assert "the limit of hex8" in out
     assert {path.name for path in tmp_path.iterdir()} == {
         LOG, REFERENCE, "accuracy.csv", "accuracy.png", "accuracy.html"
     }
     code, out, said = run(*command, "--error", "3%", "--budget", "4s")
-    assert code == 0 and "error up to 3 %: standard, " in out and "at most 4 s: hex20, quarter nodes 4 mm, " in out
+    assert code == 0 and "error up to 3 %: standard, " in out and "at most 4 s: hex20, quarter nodes, graded 4 mm, " in out
     assert "    --preset standard --set mesher=swept --set mesher.order=2 --set mesher.layers=2" in out
     code, out, said = run(*command, "--error", "0.001%")
     assert code == 1 and "no rung of this ladder does (--full has more); the most accurate is" in out
