@@ -85,12 +85,15 @@ _set_option = click.option(
 @_set_option
 @click.option("--record", type=click.Path(path_type=Path), metavar="DIR",
               help="Keep the trajectories there, readable by ParaView.")
+@click.option("--checkpoints", type=click.Path(path_type=Path), metavar="DIR",
+              help="Keep each simulation there as it goes on; one that was stopped goes on from there.")
 @click.option("--estimate-error", is_flag=True,
               help="Simulate again with a coarser mesh and with longer steps, and say how far off the result is.")
 @click.option("--quiet", is_flag=True, help="Print nothing but what goes wrong.")
 def evaluate(
     design: str, object_names: tuple[str, ...], surfaces: tuple[str, ...], mass_g: float | None, out: Path | None,
-    jobs: int, preset: str, settings: tuple[str, ...], record: Path | None, estimate_error: bool, quiet: bool,
+    jobs: int, preset: str, settings: tuple[str, ...], record: Path | None, checkpoints: Path | None,
+    estimate_error: bool, quiet: bool,
 ) -> None:
     """Build a gripper, close it on every object in a simulation, and say which it holds."""
     from finqd.cli_files import usable_folder, written_at_end
@@ -100,12 +103,12 @@ def evaluate(
     chosen = _read_design(design, settings, preset)
     objects = [*_split(object_names), *_read_surfaces(surfaces, mass_g)] or None
     with written_at_end(out, "--out") as write, shown_progress(quiet=quiet) as progress:
-        folder = usable_folder(record, "--record")
+        folder, kept = usable_folder(record, "--record"), usable_folder(checkpoints, "--checkpoints")
         from finqd.evaluate import evaluate as run  # takes a second, so only when nothing is left to refuse
 
         result = run(
             chosen, objects=objects, preset=preset, jobs=jobs, record=folder, progress=progress,
-            estimate_error=estimate_error,
+            estimate_error=estimate_error, checkpoints=kept,
         )
         write(json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     if not quiet:

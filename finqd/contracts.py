@@ -166,6 +166,12 @@ class ContactPotential(Protocol):
     def commit(self, state: State) -> None:
         """Accept ``state`` as the end of the step: return mapping of the elastic slip, forces, penetrations."""
 
+    def history(self) -> dict[str, np.ndarray]:
+        """Return by name what later steps depend on beside the state, between `commit` and the next `begin_step`."""
+
+    def restore(self, history: dict[str, np.ndarray]) -> None:
+        """Go on as after the commit from which ``history`` is: the same bits follow."""
+
 
 class Contact(Protocol):
     """Contact and friction model."""

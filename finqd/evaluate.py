@@ -108,13 +108,15 @@ def evaluate(
     design: Design, *, objects: Sequence[str | Path | GraspObject] | None = None, preset: str = "standard",
     overrides: Mapping[str, Any] | None = None, jobs: int = 1, record: Path | None = None,
     progress: Callable[[str, float], None] | None = None, estimate_error: bool = False,
+    checkpoints: Path | None = None,
 ) -> Evaluation:
     """Build ``design``, mesh it, close it on every object (default: the ten that come with finqd), and score it.
 
     overrides: design values by JSON path, stronger than ``preset``; jobs: grasps side by side; record: folder for
     ParaView files; progress: called with object name and share done; estimate_error: simulate again one level away in
-    mesh and in time step, and say how far off the result is (`finqd.estimate`). Raises InputError for bad input;
-    whatever fails in mesh or simulation is in the result.
+    mesh and in time step, and say how far off the result is (`finqd.estimate`); checkpoints: folder in which each grasp
+    is kept as it goes on, and from which one that was stopped goes on. Raises InputError for bad input; whatever fails
+    in mesh or simulation is in the result.
     """
     begun = clock.perf_counter()
     chosen = apply_preset(design, preset, overrides=overrides)
@@ -134,7 +136,13 @@ def evaluate(
     timings["mesh"] = clock.perf_counter() - meshed
     simulated = clock.perf_counter()
     if status == "ok":
-        tasks = [GraspTask(design=chosen, meshes=meshes, grasped=g, record=record is not None) for g in grasped]
+        tasks = [
+            GraspTask(
+                design=chosen, meshes=meshes, grasped=g, record=record is not None,
+                checkpoint=None if checkpoints is None else Path(checkpoints) / f"{g.name}.npz",
+            )
+            for g in grasped
+        ]
         found = run_grasps(tasks, jobs=jobs, record=record, progress=progress)
         trajectories = {g.name: trajectory for g, trajectory in zip(grasped, found, strict=True)}
     else:

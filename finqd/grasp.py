@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,12 +31,14 @@ class GraspTask:
     """What one simulation needs; travels to worker processes.
 
     meshes: one a finger, in the finger frame [m]
+    checkpoint: file that the simulation is kept in, and goes on from (see `finqd.simulate.simulate`)
     """
 
     design: Design
     meshes: tuple[Mesh, ...]
     grasped: GraspObject
     record: bool = False
+    checkpoint: Path | None = None
 
 
 def lift_start(protocol: GraspProtocol) -> float:
@@ -121,7 +124,7 @@ def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Tra
     trajectory = simulate(
         scene, duration=grasp_duration(protocol), time_step=protocol.time_step_ms * MS,
         stepper=design.plugin("stepper"), contact=design.plugin("contact"), record=task.record,
-        wall_clock_limit=protocol.si("wall_clock_limit_s"), progress=progress,
+        wall_clock_limit=protocol.si("wall_clock_limit_s"), progress=progress, checkpoint=task.checkpoint,
     )
     return replace(
         trajectory, object_name=task.grasped.name, protocol=protocol, object_drop=object_drop(trajectory, protocol)

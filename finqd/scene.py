@@ -208,7 +208,7 @@ class Scene:
         self.soft_bodies: list[SoftBody] = []
         self.rigid_bodies: list[RigidBody] = []
         self.planes: list[Plane] = []
-        self._pair_friction: dict[frozenset[str], float] = {}
+        self.pair_friction: dict[frozenset[str], float] = {}
 
     def add_soft(
         self, mesh: Mesh, material: Material, *, elasticity: Any = "corotated", name: str = "",
@@ -271,11 +271,11 @@ class Scene:
                 raise InputError(f"no body is called {name!r}; there are {sorted(self.names)}")
         if not 0.0 <= coefficient < math.inf:
             raise InputError(f"a friction coefficient must be at least 0, not {coefficient}")
-        self._pair_friction[frozenset((a, b))] = float(coefficient)
+        self.pair_friction[frozenset((a, b))] = float(coefficient)
 
     def friction_between(self, a: str, b: str) -> float:
         """Return Coulomb's coefficient of a pair."""
-        return self._pair_friction.get(frozenset((a, b)), self.friction)
+        return self.pair_friction.get(frozenset((a, b)), self.friction)
 
     @property
     def names(self) -> set[str]:

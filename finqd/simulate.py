@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from finqd import registry
+from finqd.checkpoint import Checkpoint, fingerprint
 from finqd.errors import InputError
 from finqd.mechanics.state import State, StepReport
 from finqd.mechanics.system import System
@@ -113,19 +116,115 @@ class _StepControl:
         return True
 
 
+@dataclass(kw_only=True)
+class _Run:
+    """A simulation on its way: ``done`` of its ``frames`` are behind it."""
+
+    system: System
+    stepper: Any
+    recorder: _Recorder
+    control: _StepControl
+    state: State
+    duration: float
+    frames: int
+    done: int = 0
+    status: str = "ok"
+    reason: str = ""
+    report: StepReport = field(default_factory=StepReport)
+
+    def start(self) -> None:
+        """Take the first frame."""
+        self.system.contact.begin_step(self.state)
+        self.system.contact.commit(self.state)
+        self.recorder.frame(self.system, self.state)
+
+    def go(self, after_step: Callable[[], None], progress: Callable[[float], None] | None) -> None:
+        """Step to the end, or until ``status`` is not "ok" any more."""
+        while self.done < self.frames:
+            frame_end = self.duration * (self.done + 1) / self.frames
+            while self.status == "ok" and self.state.time < frame_end * (1 - 1e-12):
+                self._step(frame_end - self.state.time)
+                after_step()
+            if self.status != "ok":
+                break
+            self.recorder.frame(self.system, self.state)
+            self.done += 1
+            if progress is not None:
+                progress(self.done / self.frames)
+
+    def _step(self, left: float) -> None:
+        dt = self.control.length(left)
+        self.state, self.report = self.stepper.step(self.system, self.state, dt)
+        self.recorder.count(self.report)
+        penetration = self.system.contact.penetration
+        self.recorder.largest_penetration = max(self.recorder.largest_penetration, penetration)
+        if not self.control.judge(self.report, dt):
+            self.status = "diverged"
+            self.reason = f"at t = {self.state.time:.4f} s, dt = {dt:.2g} s: {self.report.reason}"
+
+
+@dataclass(kw_only=True)
+class _Keeper:
+    """Writes a run to its checkpoint now and then; never changes how it goes."""
+
+    path: Path
+    fingerprint: str
+    every: float
+    last: float = field(default_factory=clock.perf_counter)
+
+    def look(self, run: _Run) -> None:
+        """Save the run if the last time is long ago."""
+        if clock.perf_counter() - self.last >= self.every:
+            self.save(run)
+
+    def save(self, run: _Run) -> None:
+        """Write the run as it is after its last step."""
+        rows, control = run.recorder.rows, run.control
+        header = {
+            "done": run.done, "status": run.status, "reason": run.reason, "counters": run.recorder.counters,
+            "largest_penetration": run.recorder.largest_penetration, "halvings": control.halvings,
+            "calm": control.calm, "proposed": control.proposed,
+        }
+        Checkpoint(
+            fingerprint=self.fingerprint, state=run.state, history=run.system.history(),
+            rows={name: np.array(values) for name, values in rows.items()}, header=header,
+        ).save(self.path)
+        self.last = clock.perf_counter()
+
+    def restore(self, run: _Run) -> bool:
+        """Take the run to where the checkpoint is, if there is one; return whether there is."""
+        if not self.path.exists():
+            return False
+        kept = Checkpoint.load(self.path, fingerprint=self.fingerprint)
+        head = kept.header
+        run.state, run.done = kept.state, head["done"]
+        run.system.restore(kept.history)
+        run.recorder.rows = {name: list(values) for name, values in kept.rows.items()}
+        run.recorder.counters, run.recorder.largest_penetration = dict(head["counters"]), head["largest_penetration"]
+        run.control.halvings, run.control.calm = head["halvings"], head["calm"]
+        run.control.proposed = head["proposed"]
+        if head["status"] == "diverged":
+            run.status, run.reason = head["status"], head["reason"]
+        return True
+
+
 def simulate(
     scene: Scene, *, duration: float, time_step: float, stepper: Any = "implicit_euler", contact: Any = "penalty",
     record: bool = False, wall_clock_limit: float = math.inf, progress: Callable[[float], None] | None = None,
-    watch: Callable[[System, State], None] | None = None,
+    watch: Callable[[System, State], None] | None = None, checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint_every: float = 10.0,
 ) -> Trajectory:
     """Run ``scene`` for ``duration`` [s] in steps of at most ``time_step`` [s].
 
     stepper, contact: plugins or their names. record: keep soft positions of every frame (one a time step).
     progress: called with the share of time done; watch: called with the system and the state after every step.
+    checkpoint: a file that the simulation is kept in, written every ``checkpoint_every`` [s] of computing and at its
+    end. If it is there already, the simulation goes on from it, and ends with the same bits as one that was never
+    stopped; the time limit begins anew.
     A step that fails is halved, up to 2^-8, then the run ends with status ``diverged``; a run that takes longer than
     ``wall_clock_limit`` [s] ends with status ``timeout``. A stepper that estimates its error chooses its steps itself,
     within the same bounds; then ``time_step`` is only how often a frame is kept. Raises InputError for numbers that
-    make no sense.
+    make no sense, and for a checkpoint that is damaged or belongs to another simulation.
     """
     for name, value in (("duration", duration), ("time_step", time_step)):
         if not (math.isfinite(value) and value > 0.0):
@@ -134,33 +233,31 @@ def simulate(
     stepper = registry.create("stepper", stepper) if isinstance(stepper, (str, dict)) else stepper
     contact = registry.create("contact", contact) if isinstance(contact, (str, dict)) else contact
     system = System(scene, contact=contact)
-    state = system.initial_state()
-    recorder = _Recorder(record=record)
-    system.contact.begin_step(state)
-    system.contact.commit(state)
-    recorder.frame(system, state)
-    set_up = clock.perf_counter() - begun
-    status, reason = "ok", ""
     frames = max(round(duration / time_step), 1)
-    control = _StepControl(frame=duration / frames)
-    system.shortest_step = control.shortest
-    for frame in range(1, frames + 1):
-        frame_end = duration * frame / frames
-        while status == "ok" and state.time < frame_end * (1 - 1e-12):
-            dt = control.length(frame_end - state.time)
-            state, report = stepper.step(system, state, dt)
-            recorder.count(report)
-            recorder.largest_penetration = max(recorder.largest_penetration, system.contact.penetration)
-            if not control.judge(report, dt):
-                status, reason = "diverged", f"at t = {state.time:.4f} s, dt = {dt:.2g} s: {report.reason}"
-            elif report.converged and watch is not None:
-                watch(system, state)
-            if status == "ok" and clock.perf_counter() - begun > wall_clock_limit:
-                status, reason = "timeout", f"at t = {state.time:.4f} s after {wall_clock_limit:g} s of computing"
-        if status != "ok":
-            break
-        recorder.frame(system, state)
-        if progress is not None:
-            progress(frame / frames)
+    run = _Run(
+        system=system, stepper=stepper, duration=duration, frames=frames, recorder=_Recorder(record=record),
+        control=_StepControl(frame=duration / frames), state=system.initial_state(),
+    )
+    system.shortest_step = run.control.shortest
+    keeper = None
+    if checkpoint is not None:
+        named = fingerprint(scene, duration=duration, frames=frames, record=record, stepper=stepper, contact=contact)
+        keeper = _Keeper(path=Path(checkpoint), fingerprint=named, every=checkpoint_every)
+    if keeper is None or not keeper.restore(run):
+        run.start()
+    set_up = clock.perf_counter() - begun
+
+    def after_step() -> None:
+        if keeper is not None:
+            keeper.look(run)
+        if run.report.converged and watch is not None:
+            watch(system, run.state)
+        if run.status == "ok" and clock.perf_counter() - begun > wall_clock_limit:
+            run.status = "timeout"
+            run.reason = f"at t = {run.state.time:.4f} s after {wall_clock_limit:g} s of computing"
+
+    run.go(after_step, progress)
+    if keeper is not None:
+        keeper.save(run)
     timings = {"set_up": set_up, "steps": clock.perf_counter() - begun - set_up}
-    return recorder.trajectory(status=status, reason=reason, timings=timings)
+    return run.recorder.trajectory(status=run.status, reason=run.reason, timings=timings)

@@ -36,7 +36,7 @@ VERSION = 1
 Surface = tuple[np.ndarray, np.ndarray]
 
 #: what NumPy, zipfile and json raise for bytes that are not what they should be
-_DAMAGE = (
+DAMAGE = (
     OSError, EOFError, ValueError, KeyError, AttributeError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 
@@ -132,7 +132,7 @@ class Trajectory:
             version = header.pop("version")
         except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
             raise InputError(f"cannot be read: {error.strerror}", str(path)) from error
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise InputError("damaged, or not a finqd trajectory", str(path)) from error
         if version != VERSION:
             raise InputError(f"format version {version}; this finqd reads version {VERSION}", str(path))

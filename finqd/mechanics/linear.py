@@ -121,6 +121,22 @@ class CoupledInverse:
             self._schur_inverse, definite = _symmetric_inverse(0.5 * (schur + schur.T))
             self.positive = self.positive and definite
 
+    @classmethod
+    def restored(
+        cls, factorisation: Factorisation, eliminated: np.ndarray, schur_inverse: np.ndarray
+    ) -> CoupledInverse:
+        """Return an inverse from its parts; the matrix of ``factorisation`` has been factorised."""
+        inverse = cls.__new__(cls)
+        inverse._factorisation, inverse.positive, inverse._size = factorisation, True, len(eliminated)
+        inverse._eliminated, inverse._schur_inverse = eliminated, schur_inverse
+        return inverse
+
+    @property
+    def parts(self) -> dict[str, np.ndarray]:
+        """What `restored` takes, and the ``values`` of the factorised matrix."""
+        values = self._factorisation.values if self._size else np.zeros(0)
+        return {"values": values, "eliminated": self._eliminated, "schur_inverse": self._schur_inverse}
+
     def fits(self, matrix: CoupledMatrix) -> bool:
         """Tell whether ``matrix`` has the same number of unknowns as the one that was inverted."""
         return self._eliminated.shape == matrix.coupling.shape
@@ -316,6 +332,29 @@ class LinearSolver:
     def forget(self) -> None:
         """Drop the lagged preconditioner: the next system is known to be a different one."""
         self._lagged = None
+
+    def history(self) -> dict[str, np.ndarray]:
+        """Return what later solutions depend on, for `restore`: the lagged inverse, and what it has served for."""
+        counts = np.array([self._refactor_cost, self._spent, self._solved, self._served], dtype=float)
+        single = self._factorisation is not None and self._factorisation.single
+        kept = self._lagged.parts if self._lagged is not None else {}
+        return {"counts": counts, "single": np.array(single), **kept}
+
+    def restore(self, history: dict[str, np.ndarray]) -> None:
+        """Go on where the solver was whose `history` this is: the same bits follow."""
+        cost, spent, solved, served = history["counts"].tolist()
+        self._refactor_cost, self._spent, self._solved, self._served = cost, int(spent), int(solved), bool(served)
+        if self._factorisation is None:
+            return
+        if self._factorisation.single and not history["single"]:
+            self._factorisation = create_factorisation(self._backend, self.pattern)
+        if "values" in history:
+            if len(history["eliminated"]):
+                self._factorisation.values[:] = history["values"]
+                self._factorisation.factorise(None)
+            self._lagged = CoupledInverse.restored(
+                self._factorisation, history["eliminated"], history["schur_inverse"]
+            )
 
     def _jacobi_cg(self, matrix: CoupledMatrix, rhs: np.ndarray, tolerance: float) -> _Iterate:
         preconditioner = (Jacobi if self.preconditioner == "jacobi" else BlockJacobi)(matrix)

@@ -45,8 +45,14 @@ class Factorisation(Protocol):
     #: whether it computes in single precision
     single: bool
 
-    def factorise(self, blocks: np.ndarray) -> bool:
+    @property
+    def values(self) -> np.ndarray:
+        """Entries of the matrix that was factorised last, as the library holds them, (n_entries,)."""
+
+    def factorise(self, blocks: np.ndarray | None) -> bool:
         """Factorise the matrix with these ``blocks`` (of `BlockPattern`); return whether it is positive definite.
+
+        None: the one whose entries have been written to `values`; it gives the same bits as from blocks.
 
         Raises ``numpy.linalg.LinAlgError`` if it is singular, or indefinite and the library stops there.
         """
@@ -123,9 +129,10 @@ class Rows:
         self.values = np.empty(len(source), dtype)
         self._source = source[order].astype(np.uint32)
 
-    def fill(self, blocks: np.ndarray) -> np.ndarray:
-        """Copy ``blocks`` into ``values``, in the order of ``indices``, and return it."""
-        gather(blocks.reshape(-1), self._source, self.values)
+    def fill(self, blocks: np.ndarray | None) -> np.ndarray:
+        """Copy ``blocks``, if there are any, into ``values``, in the order of ``indices``, and return it."""
+        if blocks is not None:
+            gather(blocks.reshape(-1), self._source, self.values)
         return self.values
 
     def as_columns(self) -> sp.csc_matrix:
@@ -145,7 +152,12 @@ class QdldlFactorisation:
         self._solver: Any = None
         self.factor_entries = 0
 
-    def factorise(self, blocks: np.ndarray) -> bool:
+    @property
+    def values(self) -> np.ndarray:
+        """See `Factorisation`."""
+        return self._rows.values
+
+    def factorise(self, blocks: np.ndarray | None) -> bool:
         """See `Factorisation`."""
         import qdldl
 
@@ -187,7 +199,12 @@ class SuperluFactorisation:
         self._factors: Any = None
         self.factor_entries = 0
 
-    def factorise(self, blocks: np.ndarray) -> bool:
+    @property
+    def values(self) -> np.ndarray:
+        """See `Factorisation`."""
+        return self._rows.values
+
+    def factorise(self, blocks: np.ndarray | None) -> bool:
         """See `Factorisation`. Without off-diagonal pivots L U is L D L^T: U's diagonal shows the inertia."""
         from scipy.sparse.linalg import splu
 
@@ -222,7 +239,12 @@ class CholmodFactorisation:
         self._factor: Any = None
         self.factor_entries = 0
 
-    def factorise(self, blocks: np.ndarray) -> bool:
+    @property
+    def values(self) -> np.ndarray:
+        """See `Factorisation`."""
+        return self._rows.values
+
+    def factorise(self, blocks: np.ndarray | None) -> bool:
         """See `Factorisation`."""
         from sksparse.cholmod import CholmodError, analyze
 
@@ -254,7 +276,12 @@ class PardisoFactorisation:
         self._pardiso = _Pardiso(self._rows)
         self.factor_entries = 0
 
-    def factorise(self, blocks: np.ndarray) -> bool:
+    @property
+    def values(self) -> np.ndarray:
+        """See `Factorisation`."""
+        return self._rows.values
+
+    def factorise(self, blocks: np.ndarray | None) -> bool:
         """See `Factorisation`."""
         self._rows.fill(blocks)
         if not self._pardiso.factorise():

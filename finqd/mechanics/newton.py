@@ -64,12 +64,10 @@ class NewtonOptions:
     def solver(self, system: System) -> LinearSolver:
         """Return the linear solver of these options for ``system``, which keeps it from step to step."""
         key = (self.linear_solver, self.preconditioner, self.backend, self.linear_iterations)
-        if key not in system.solvers:
-            system.solvers[key] = make_solver(
-                system.pattern, method=self.linear_solver, preconditioner=self.preconditioner, backend=self.backend,
-                max_iterations=self.linear_iterations, tolerance=self.linear_tolerance,
-            )
-        return system.solvers[key]
+        return system.solver(key, lambda: make_solver(
+            system.pattern, method=self.linear_solver, preconditioner=self.preconditioner, backend=self.backend,
+            max_iterations=self.linear_iterations, tolerance=self.linear_tolerance,
+        ))
 
 
 @dataclass

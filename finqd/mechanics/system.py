@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from finqd.mechanics.state import Direction, State
 
 if TYPE_CHECKING:
     from finqd.contracts import Contact
+    from finqd.mechanics.linear import LinearSolver
     from finqd.scene import Scene
 
 
@@ -90,7 +92,33 @@ class System:
         self._strained: np.ndarray | None = None
         self._elastic, self._elastic_energy = np.zeros((n, 3)), 0.0
         self.shortest_step = 0.0
-        self.solvers: dict[tuple, object] = {}  # of the steppers, by their settings: they keep lagged factorisations
+        self._solvers: dict[str, LinearSolver] = {}  # of the steppers, by their settings
+        self._histories: dict[str, dict[str, np.ndarray]] = {}  # of solvers that have not been asked for yet
+
+    def solver(self, settings: tuple, make: Callable[[], LinearSolver]) -> LinearSolver:
+        """Return the solver with these ``settings``, made if there is none yet: what it lags goes from step to step."""
+        key = repr(settings)
+        if key not in self._solvers:
+            self._solvers[key] = make()
+            if key in self._histories:
+                self._solvers[key].restore(self._histories.pop(key))
+        return self._solvers[key]
+
+    def history(self) -> dict[str, np.ndarray]:
+        """Return by name what the next steps depend on beside the state: contact's history, and the solvers'."""
+        solvers = {**{key: solver.history() for key, solver in self._solvers.items()}, **self._histories}
+        parts = {"contact": self.contact.history(), **{f"solver {key}": part for key, part in solvers.items()}}
+        return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
+
+    def restore(self, history: Mapping[str, np.ndarray]) -> None:
+        """Go on with the `history` of a system like this one."""
+        parts: dict[str, dict[str, np.ndarray]] = {}
+        for path, value in history.items():
+            part, _, name = path.rpartition("/")
+            parts.setdefault(part, {})[name] = value
+        self.contact.restore(parts.pop("contact"))
+        self._histories = {part.removeprefix("solver "): values for part, values in parts.items()}
+        self._solvers = {}
 
     @property
     def n_vertices(self) -> int:

@@ -250,11 +250,24 @@ class PenaltyContact:
         self.soft_forces = self._forces_by_body(rows.forces(self.options.smoothing_mm * MM))
         self.penetration = float(np.max(-rows.gap[: rows.count], initial=0.0))
 
+    def history(self) -> dict[str, np.ndarray]:
+        """Return what later steps depend on: elastic slips by key, forces and penetration of the last commit."""
+        return {
+            "slip_keys": self.slips.keys, "slips": self.slips.values, "soft_forces": self.soft_forces,
+            "penetration": np.array(self.penetration),
+        }
+
+    def restore(self, history: dict[str, np.ndarray]) -> None:
+        """Go on with a `history`."""
+        self.slips = KeyedValues(keys=history["slip_keys"], values=history["slips"])
+        self.soft_forces, self.penetration = history["soft_forces"], float(history["penetration"])
+
     def _forces_by_body(self, force: np.ndarray) -> np.ndarray:
         """Return the summed normal force on each soft body [N], from that of each row."""
         face = self.rows.face[: self.rows.count]
         soft = face >= 0
-        return np.bincount(self.surface.face_body[face[soft]], force[soft], minlength=len(self.scene.soft_bodies))
+        bodies = self.surface.face_body[face[soft]]
+        return np.bincount(bodies, force[soft], minlength=len(self.scene.soft_bodies)).astype(float)
 
     def _trial_slips(self, state: State) -> np.ndarray:
         f, start = self.friction, self.start

@@ -35,13 +35,12 @@ class Imex(SubstepOptions):
     def step(self, system: System, state: State, dt: float) -> tuple[State, StepReport]:
         """Return the state after ``dt`` [s], or ``state`` itself and the reason."""
         key = ("imex", self.linear_solver, self.preconditioner, self.backend, self.linear_tolerance)
-        if key not in system.solvers:
-            system.solvers[key] = make_solver(
-                system.pattern, method=self.linear_solver, preconditioner=self.preconditioner, backend=self.backend,
-                tolerance=self.linear_tolerance,
-            )
+        solver = system.solver(key, lambda: make_solver(
+            system.pattern, method=self.linear_solver, preconditioner=self.preconditioner, backend=self.backend,
+            tolerance=self.linear_tolerance,
+        ))
         system.contact.begin_step(state)
-        method = LinearlyImplicit(system, state, system.solvers[key], self.damping_per_s)
+        method = LinearlyImplicit(system, state, solver, self.damping_per_s)
         end, report = substeps(Motion(system, state, dt), method, self)
         report.cg_iterations, report.factorisations = method.cg_iterations, method.factorisations
         return end, report
