@@ -25,6 +25,7 @@ COLOURS = {
     "newton": "#b58b00", "linear": "#5c7fd6", "contact": "#d1699b", "elasticity": "#7a5230",
 }
 MARKS = "osD^vP<>hX*pd"
+Box = tuple[float, float, float, float]  # left, bottom, right, top
 LABEL_WIDTH, LABEL_HEIGHT = 5.6, 26.0  # of a letter, and of a label's two lines [points]
 
 
@@ -85,19 +86,21 @@ def _lowest(study: Study, rows: Sequence[Row]) -> float:
 
 def _mark_presets(axes: Axes, presets: Mapping[str, Row], lowest: float) -> None:
     """Mark each preset by a star and a label, which lies where it covers no star and no other label."""
-    taken: list[tuple[float, float, float, float]] = []
+    taken: list[Box] = []
     points = {
         name: (row["seconds"], max(abs(row["error_percent"]), lowest))
         for name, row in sorted(presets.items(), key=lambda item: item[1]["seconds"])
     }
-    seen = {name: axes.transData.transform(point) * 72.0 / axes.figure.dpi for name, point in points.items()}
+    seen = {name: axes.transData.transform(point) * (72.0 / axes.figure.dpi) for name, point in points.items()}
     taken += [(x - 9, y - 9, x + 9, y + 9) for x, y in seen.values()]
+    left, bottom, right, top = (value * 72.0 / axes.figure.dpi for value in axes.get_window_extent().extents)
     for name, point in points.items():
         axes.plot(*point, marker="*", markersize=17, color=PRESET, markeredgecolor="white", linestyle="", zorder=9)
         text = "the paper's setting" if name == "paper" else name
         error = abs(presets[name]["error_percent"])
         told = f"{text}\n{error:.{3 if error >= 100.0 else 2}g} %, {presets[name]['seconds']:.2g} s"
-        shift, box = _free_place(seen[name], LABEL_WIDTH * max(map(len, told.split("\n"))), taken)
+        width = LABEL_WIDTH * max(map(len, told.split("\n")))
+        shift, box = _free_place(tuple(seen[name]), width, taken, (left, bottom, right, top))
         taken.append(box)
         axes.annotate(
             told, point, xytext=shift, textcoords="offset points", ha="center", va="center", fontsize=9.5,
@@ -107,15 +110,18 @@ def _mark_presets(axes: Axes, presets: Mapping[str, Row], lowest: float) -> None
 
 
 def _free_place(
-    point: Sequence[float], width: float, taken: Sequence[tuple[float, float, float, float]]
-) -> tuple[tuple[float, float], tuple[float, float, float, float]]:
+    point: Sequence[float], width: float, taken: Sequence[Box], inside: Box
+) -> tuple[tuple[float, float], Box]:
     """Return how far from ``point`` the middle of a label lies that covers nothing, and its box; all in points."""
     angles = [math.pi * share for share in (0.5, -0.5, -0.1, 0.1, 0.9, 1.1)]
     places = [(1.6 * far * math.cos(a), far * math.sin(a)) for far in range(32, 240, 12) for a in angles]
     centres = [(point[0] + dx, point[1] + dy) for dx, dy in places]
     across, up = 0.5 * width, 0.5 * LABEL_HEIGHT
     boxes = [(x - across, y - up, x + across, y + up) for x, y in centres]
-    clear = [all(b[0] > t[2] or b[2] < t[0] or b[1] > t[3] or b[3] < t[1] for t in taken) for b in boxes]
+    clear = [
+        b[0] >= inside[0] and b[1] >= inside[1] and b[2] <= inside[2] and b[3] <= inside[3]
+        and all(b[0] > t[2] or b[2] < t[0] or b[1] > t[3] or b[3] < t[1] for t in taken) for b in boxes
+    ]
     best = clear.index(True) if True in clear else 0
     return places[best], boxes[best]
 
@@ -123,11 +129,18 @@ def _free_place(
 def _dress(axes: Axes, study: Study) -> None:
     from matplotlib.ticker import FuncFormatter, LogFormatter
 
+    class Plain(LogFormatter):
+        """Labels what `LogFormatter` would, without powers of ten."""
+
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return f"{x:g}" if super().__call__(x, pos) else ""
+
     quantity = study.case.quantities[study.case.main]
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_major_formatter(plain)
     axes.yaxis.set_major_formatter(plain)
-    axes.xaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.5, 0.5)))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(Plain(labelOnlyBase=False, minor_thresholds=(1.5, 0.5)))
     axes.set_xlabel("seconds on one core (without meshing and compiling)", color=INK)
     axes.set_ylabel(f"error of the {quantity.label} [%]", color=INK)
     axes.set_title(f"{study.case.title}: {study.design.name}", fontsize=12, color=INK)

@@ -558,7 +558,8 @@ def test_labels_of_presets_cover_neither_stars_nor_each_other():
     stars = [(100.0 + 9.0 * i, 100.0) for i in range(5)]
     taken = [(x - 9.0, y - 9.0, x + 9.0, y + 9.0) for x, y in stars]
     for star in stars:
-        (dx, dy), box = _free_place(star, 80.0, taken)
+        (dx, dy), box = _free_place(star, 80.0, taken, (0.0, 80.0, 240.0, 400.0))
+        assert box[0] >= 0.0 and box[1] >= 80.0 and box[2] <= 240.0 and box[3] <= 400.0
         assert box == pytest.approx((star[0] + dx - 40, star[1] + dy - 13, star[0] + dx + 40, star[1] + dy + 13))
         assert all(box[0] > b[2] or box[2] < b[0] or box[1] > b[3] or box[3] < b[1] for b in taken)
         taken.append(box)

@@ -126,7 +126,7 @@ class Rows:
         self.size = 3 * pattern.n_vertices
         self.indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=self.size))]).astype(np.int32)
         self.indices = columns[order].astype(np.int32)
-        self.values = np.empty(len(source), dtype)
+        self.values: np.ndarray = np.empty(len(source), dtype)
         self._source = source[order].astype(np.uint32)
 
     def fill(self, blocks: np.ndarray | None) -> np.ndarray:
