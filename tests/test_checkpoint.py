@@ -98,7 +98,7 @@ def test_so_does_one_with_substeps(stepper, tmp_path):
     options = {"stepper": stepper, "contact": {"name": "penalty", "stiffness_N_mm3": 1.0}, "duration": 0.04,
                "time_step": 0.005}
     whole = kept_run(sliding(), **options)
-    assert whole.status == "ok" and whole.penetrations.max() > 1e-5
+    assert whole.status == "ok" and whole.soft_positions[-1, :, 2].min() > -1e-4, "the floor does not carry it"
     with pytest.raises(Stopped):
         kept_run(sliding(), tmp_path / "run.npz", stop_at=5, **options)
     assert_same(kept_run(sliding(), tmp_path / "run.npz", **options), whole)
