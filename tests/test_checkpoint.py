@@ -50,7 +50,7 @@ def kept_run(scene: Scene, path: Path | None = None, *, stop_at: int | None = No
         if steps == stop_at:
             raise Stopped
 
-    arguments = {"duration": 0.4, "time_step": 0.02, "record": True, **options}
+    arguments = {"duration": 0.4, "time_step": 0.04, "record": True, **options}
     if path is not None:
         arguments |= {"checkpoint": path, "checkpoint_every": 0.0}
     return simulate(scene, watch=watch, **arguments)
@@ -77,7 +77,7 @@ STEPPERS = [
 def test_a_run_that_was_stopped_ends_with_the_same_bits(stepper, tmp_path):
     whole = kept_run(pads(), stepper=stepper)
     assert whole.status == "ok" and whole.contact_forces.max() > 1.0, "nothing is grasped"
-    for number, stops in enumerate([(1,), (9,), (4, 6, 3)]):
+    for number, stops in enumerate([(1,), (3, 4)]):
         path = tmp_path / f"{number}.npz"
         for stop in stops:
             with pytest.raises(Stopped):
@@ -118,7 +118,7 @@ def test_without_friction_history_the_bits_would_differ(tmp_path, monkeypatch):
 
     whole = kept_run(pads())
     with pytest.raises(Stopped):
-        kept_run(pads(), tmp_path / "run.npz", stop_at=14)
+        kept_run(pads(), tmp_path / "run.npz", stop_at=7)
     restore = PenaltyContact.restore
 
     def forgetful(self, history):

@@ -48,9 +48,9 @@ class FakeEvaluate:
     def __init__(self):
         self.calls, self.error, self.result = [], None, RESULT
 
-    def __call__(self, design, *, objects, preset, jobs, record, progress, estimate_error):
+    def __call__(self, design, *, objects, preset, jobs, record, progress, estimate_error, checkpoints):
         call = {"design": design, "objects": objects, "preset": preset, "jobs": jobs, "record": record}
-        self.calls.append({**call, "estimate_error": estimate_error})
+        self.calls.append({**call, "estimate_error": estimate_error, "checkpoints": checkpoints})
         progress("sphere", 0.5)
         if self.error is not None:
             raise self.error

@@ -111,10 +111,12 @@ def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
     return np.maximum(np.ceil(np.stack([u, v], axis=1) / spacing - 1e-6), 1).astype(int)
 
 
-def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSurface:
+def contact_surface(
+    bodies: Sequence[SoftBody], *, spacing: float, most_cells: int | None = None
+) -> ContactSurface:
     """Return the surface of ``bodies`` with samples about ``spacing`` [m] apart, at most on faces that stretch evenly.
 
-    Faces that are held are left out.
+    Faces that are held are left out. ``most_cells``: samples along an edge of a face are no more than that.
     """
     width = max((f.shape[1] for body in bodies for f in body.mesh.faces.values() if len(f)), default=4)
     lattices: dict[tuple[str, int, int], int] = {}
@@ -130,7 +132,7 @@ def contact_surface(bodies: Sequence[SoftBody], *, spacing: float) -> ContactSur
             faces.append(_padded(block + body.first_vertex, width, -1))
             owner.append(np.full(len(block), number))
             area.append(_areas(points, kind))
-            for n, m in _cells(points, kind, spacing):
+            for n, m in np.minimum(_cells(points, kind, spacing), most_cells or np.iinfo(int).max):
                 if (kind, n, m) not in lattices:
                     lattices[kind, n, m] = len(lattices)
                     weights.append(_padded(contact_shape(kind, lattice(kind, int(n), int(m))), width, 0.0))

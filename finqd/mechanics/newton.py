@@ -24,6 +24,7 @@ PATIENCE = 2  # times as many renewals are granted before what they leave makes 
 EARLY = 0.05  # [N] residual at which friction bounds are renewed for the first time, before the minimum is found
 INNER = 0.1  # share of what a renewal unbalanced that Newton leaves before the next one: it will unbalance more
 RELAXATIONS = 60  # iterations of rigid bodies alone in a step, and as many more for each renewal
+LIGHT = 0.1  # [N] weight below which forces count as relative to that of the lightest free body
 FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 HALVINGS = 31  # of the Newton step, before the line search gives up
 ENOUGH = 12  # halvings after which it is content with the lowest energy so far
@@ -39,7 +40,8 @@ class NewtonOptions:
     """Options of every stepper that minimises an incremental potential; such a plugin's own come after these.
 
     tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step, at the friction bounds that
-        it was solved with; the bounds of its end may leave more, by `LAG_FORCE` and `LAG_SHARE`
+        it was solved with; the bounds of its end may leave more, by `LAG_FORCE` and `LAG_SHARE`. All that is less, in
+        proportion, where a free body weighs less than `LIGHT`
     quasi_newton: whether directions that need no new matrix are tried first (see `finqd.mechanics.quasi_newton`)
     max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal.
         Quasi-Newton steps are not counted
@@ -114,6 +116,16 @@ class Newton:
     report: StepReport
     convexity: _Convexity = field(default_factory=_Convexity)
 
+    @property
+    def scale(self) -> float:
+        """Share of the usual forces that may be unbalanced, 1 unless a free body is very light."""
+        return min(1.0, self.system.lightest_weight / LIGHT)
+
+    @property
+    def tolerance(self) -> float:
+        """Force that may be unbalanced at a minimum [N]."""
+        return self.scale * self.options.tolerance_N
+
     def minimise(self, trial: State) -> State:
         """Return the minimum that is found from ``trial``; it is one only if ``report.converged``."""
         report, options, renewals = self.report, self.options, _Renewals()
@@ -127,7 +139,7 @@ class Newton:
                 break
             # a first iteration is always due: many small forces, each below the tolerance, must not stop the motion
             begun = report.iterations + report.quasi_iterations > 0
-            done = report.residual <= (1.0 if begun else FIRST) * options.tolerance_N
+            done = report.residual <= (1.0 if begun else FIRST) * self.tolerance
             if done or (begun and self._renewal_is_due(renewals)):
                 energy, ended = self._renew(trial, renewals, done=done)
                 quasi.renewed()
@@ -140,7 +152,7 @@ class Newton:
                 break
             moved = self._relax(trial, energy, renewals) or self._step(trial, energy, quasi)
             if moved is None:
-                if renewals.best is None and report.residual <= options.tolerance_N:  # at rest, to the last digit
+                if renewals.best is None and report.residual <= self.tolerance:  # at rest, to the last digit
                     renewals.best, renewals.best_jump, report.reason = trial, report.residual, ""
                 break
             trial, energy = moved
@@ -155,7 +167,7 @@ class Newton:
         """Tell whether friction bounds are better renewed now, though this is no minimum yet: it will move."""
         report = self.report
         if renewals.early:
-            return report.residual <= EARLY
+            return report.residual <= self.scale * EARLY
         return report.friction_updates < self.options.max_friction_updates and report.residual <= INNER * renewals.added
 
     def _renew(self, trial: State, renewals: _Renewals, *, done: bool) -> tuple[float, bool]:
@@ -168,11 +180,11 @@ class Newton:
         report.residual, report.where = self.system.residual()
         renewals.added = max(report.residual - before, 0.0)
         progress = report.residual < LAG_PROGRESS * renewals.best_jump
-        light = float(np.sum(contact.relagged_forces)) <= LAG_FORCE
+        light = float(np.sum(contact.relagged_forces)) <= self.scale * LAG_FORCE
         if done and report.residual < renewals.best_jump and (light or change <= LAG_CHANGE):
             renewals.best, renewals.best_jump = trial, report.residual
-        steady = change <= options.friction_tolerance and report.residual <= LAG_FORCE
-        still = report.residual <= options.tolerance_N or steady
+        steady = change <= options.friction_tolerance and report.residual <= self.scale * LAG_FORCE
+        still = report.residual <= self.tolerance or steady
         tired = not progress or report.friction_updates > options.max_friction_updates
         lasting = report.friction_updates > PATIENCE * options.max_friction_updates
         return energy, done and (still or (tired and (lasting or renewals.best_jump <= self._bound())))
@@ -191,11 +203,11 @@ class Newton:
 
     def _bound(self) -> float:
         """Return what renewed contact may leave unbalanced at the end of a step [N]."""
-        return max(LAG_FORCE, LAG_SHARE * float(np.max(self.system.contact.relagged_forces, initial=0.0)))
+        return max(self.scale * LAG_FORCE, LAG_SHARE * float(np.max(self.system.contact.relagged_forces, initial=0.0)))
 
     def _relax(self, trial: State, energy: float, renewals: _Renewals) -> tuple[State, float] | None:
         """Bring rigid bodies that touch nothing soft to rest while all else stays; None if that leads nowhere."""
-        report, system, least = self.report, self.system, self.options.tolerance_N
+        report, system, least = self.report, self.system, self.tolerance
         origin, found, before, free = trial, None, None, None
         while not renewals.idle and report.rigid_iterations < RELAXATIONS * (1 + report.friction_updates):
             if system.rigid_residual() <= least:

@@ -56,6 +56,7 @@ class System:
     fixed: bool, (n_vertices, 3); rigid_held: bool, (n_rigid,)
     damping: of the materials, None where they have none
     shortest_step: [s] a step this short is not rejected for its error any more
+    lightest_weight: of the bodies that nothing holds [N], at 1 g at least; inf if there is none
     """
 
     def __init__(self, scene: Scene, *, contact: Contact) -> None:
@@ -89,6 +90,9 @@ class System:
             coupling=np.zeros((3 * n, 6 * m)), rigid_matrix=np.zeros((6 * m, 6 * m)),
         )
         # where the elastic gradient was taken last, and what it was: contact is renewed without anything moving
+        free = [own.sum() for own, b in zip(own, soft, strict=True) if not b.fixed.any()]
+        free += [b.shape.mass for b in rigid if not b.held]
+        self.lightest_weight = max(float(np.linalg.norm(scene.gravity)), 9.81) * min(free, default=np.inf)
         self._strained: np.ndarray | None = None
         self._elastic, self._elastic_energy = np.zeros((n, 3)), 0.0
         self.shortest_step = 0.0

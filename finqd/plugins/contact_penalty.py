@@ -22,6 +22,8 @@ from finqd.units import MM
 
 SUPPORT_AREA = 1.0 * MM**2  # a point on which a rigid body stands is at least as stiff as this area of a soft face
 SUPPORT_ALLOWANCE = 2.0  # multiples of `weight_penetration_mm` that such a point may move into a plane in one iteration
+FINE = 0.005  # samples need not be nearer than this share of the smallest body's radius,
+PLANE_CELLS = 8  # nor more along an edge of a face than these if all there is are planes
 LEAST_SHARE = 0.4  # of the way to their new values that friction bounds go at least in a renewal
 
 
@@ -31,7 +33,8 @@ class Penalty:
 
     stiffness_N_mm3: pressure a penetration [N/mm^2 per mm]
     smoothing_mm: penetration over which the stiffness sets in
-    sample_spacing_mm: largest distance of the points on soft faces that feel contact
+    sample_spacing_mm: largest distance of the points on soft faces that feel contact; larger in scenes without bodies
+        smaller than 60 mm across the radius: `FINE`, `PLANE_CELLS`
     edge_radius_mm: with which sharp edges of rigid bodies count as rounded where soft faces touch them
     friction_stiffness_ratio: tangential over normal stiffness
     step_allowance_mm: how far a point may move into a body in one Newton step
@@ -60,9 +63,13 @@ class PenaltyContact:
 
     def __init__(self, options: Penalty, scene: Scene) -> None:
         self.options, self.scene = options, scene
-        self.surface = contact_surface(scene.soft_bodies, spacing=options.sample_spacing_mm * MM)
         self.stiffness = options.stiffness_N_mm3 / MM**3
         shapes = [body.shape for body in scene.rigid_bodies]
+        smallest = min((shape.bounding_radius for shape in shapes), default=0.0)
+        self.surface = contact_surface(
+            scene.soft_bodies, spacing=max(options.sample_spacing_mm * MM, FINE * smallest),
+            most_cells=None if shapes else PLANE_CELLS,
+        )
         touching = len(self.surface.faces) > 0
         self.fields = [rounded_field(s, options.edge_radius_mm * MM) if touching else s.distance for s in shapes]
         # under weightless conditions a body still must not sink into a plane: 1 g stands in for gravity
