@@ -42,7 +42,9 @@ def run(left: Sequence[float], changes: Sequence[float], *, force: float = HEAVY
         return changes[min(k, len(changes) - 1)]
 
     contact = SimpleNamespace(relag=relag, relagged_forces=np.array([force]))
-    system = SimpleNamespace(left=1.0, contact=contact, residual=lambda: (system.left, "the script"))
+    system = SimpleNamespace(
+        left=1.0, lightest_weight=np.inf, contact=contact, residual=lambda: (system.left, "the script")
+    )
     increment = SimpleNamespace(gradient=lambda trial: 0.0)
     report = StepReport(residuals=[])
     options = NewtonOptions(quasi_newton=False)
@@ -102,7 +104,7 @@ def test_a_search_across_a_kink_ends_at_the_kink() -> None:
     def state(x: float) -> SimpleNamespace:
         return SimpleNamespace(x=x, moved=lambda direction, share=1.0: state(x + share * direction.soft[0]))
 
-    system = SimpleNamespace(derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
+    system = SimpleNamespace(lightest_weight=np.inf, derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
     increment, report = SimpleNamespace(gradient=gradient, scale=1.0), StepReport(residuals=[])
     search = Newton(system=system, increment=increment, options=NewtonOptions(), report=report)._search
     energy = gradient(state(0.0))
@@ -144,7 +146,7 @@ def test_an_iteration_begins_with_the_projected_matrix_after_one_that_needed_it(
     def state(x: float) -> SimpleNamespace:
         return SimpleNamespace(x=x, moved=lambda direction, share=1.0: state(x + share * direction.soft[0]))
 
-    system = SimpleNamespace(derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
+    system = SimpleNamespace(lightest_weight=np.inf, derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
     increment, report = SimpleNamespace(gradient=gradient, hessian=hessian, scale=1.0), StepReport(residuals=[])
     well = Well(system=system, increment=increment, options=NewtonOptions(), report=report)
     at, order = state(0.1), []
