@@ -104,7 +104,8 @@ def test_a_search_across_a_kink_ends_at_the_kink() -> None:
     def state(x: float) -> SimpleNamespace:
         return SimpleNamespace(x=x, moved=lambda direction, share=1.0: state(x + share * direction.soft[0]))
 
-    system = SimpleNamespace(lightest_weight=np.inf, derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
+    contact = SimpleNamespace(step_limit=lambda *_: 1.0)
+    system = SimpleNamespace(lightest_weight=np.inf, derivatives=derivatives, contact=contact)
     increment, report = SimpleNamespace(gradient=gradient, scale=1.0), StepReport(residuals=[])
     search = Newton(system=system, increment=increment, options=NewtonOptions(), report=report)._search
     energy = gradient(state(0.0))
@@ -146,7 +147,8 @@ def test_an_iteration_begins_with_the_projected_matrix_after_one_that_needed_it(
     def state(x: float) -> SimpleNamespace:
         return SimpleNamespace(x=x, moved=lambda direction, share=1.0: state(x + share * direction.soft[0]))
 
-    system = SimpleNamespace(lightest_weight=np.inf, derivatives=derivatives, contact=SimpleNamespace(step_limit=lambda *_: 1.0))
+    contact = SimpleNamespace(step_limit=lambda *_: 1.0)
+    system = SimpleNamespace(lightest_weight=np.inf, derivatives=derivatives, contact=contact)
     increment, report = SimpleNamespace(gradient=gradient, hessian=hessian, scale=1.0), StepReport(residuals=[])
     well = Well(system=system, increment=increment, options=NewtonOptions(), report=report)
     at, order = state(0.1), []
