@@ -130,20 +130,24 @@ class Increment:
 
         Driven vertices are at their targets in all of them. The first is the nearest, by one order of the step, where
         motion is smooth; after an impact the last acceleration means nothing, and where its energy is not below that of
-        the second, the lower one of the others is taken.
+        the second, the lower one of the others is taken. As long as there is no last acceleration, gravity's is taken:
+        what falls freely then is where it belongs, whatever the tolerances.
         """
         start = self.start
         moving = self._start(start.velocities, start.rigid_velocities, start.angular_momenta)
         energy = self.energy(moving)
+        gained = self.dt * self.system.scene.gravity
+        ends = [start.velocities + gained, start.rigid_velocities + gained, start.angular_momenta]
         if start.previous is not None:
             before, ratio = start.previous, self.dt / (start.time - start.previous.time)
-            bent = self._start(
+            ends = [
                 start.velocities + ratio * (start.velocities - before.velocities),
                 start.rigid_velocities + ratio * (start.rigid_velocities - before.rigid_velocities),
                 start.angular_momenta + ratio * (start.angular_momenta - before.angular_momenta),
-            )
-            if self.gradient(bent) < energy:  # no dearer than the energy, as the minimisation begins with it
-                return bent
+            ]
+        bent = self._start(*ends)
+        if self.gradient(bent) < energy:  # no dearer than the energy, as the minimisation begins with it
+            return bent
         still = self._driven(start)
         return still if self.energy(still) < energy else moving
 
