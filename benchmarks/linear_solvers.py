@@ -22,9 +22,10 @@ import numpy as np  # noqa: E402
 from finqd.data import designs_folder  # noqa: E402
 from finqd.design import Design  # noqa: E402
 from finqd.grasp import GraspTask, grasp_scene  # noqa: E402
-from finqd.mechanics.linear import CoupledMatrix, LinearSolver, make_solver  # noqa: E402
+from finqd.mechanics.linear import LinearSolver, make_solver  # noqa: E402
 from finqd.mechanics.linear_backends import available_backends, create_factorisation  # noqa: E402
 from finqd.mechanics.pattern import BlockPattern  # noqa: E402
+from finqd.mechanics.preconditioners import CoupledMatrix  # noqa: E402
 from finqd.objects import load_object  # noqa: E402
 from finqd.simulate import simulate  # noqa: E402
 

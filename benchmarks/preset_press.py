@@ -23,8 +23,8 @@ from verdict_flips import designs
 from finqd.accuracy_log import append_row, read_rows
 from finqd.data import studies_folder
 from finqd.design import Design
-from finqd.evaluate import versions
 from finqd.presets import PRESETS, apply_preset
+from finqd.provenance import versions
 from finqd.runlog import write_whole
 from finqd.verification.press import REFERENCE, press_finger
 from finqd.workers import TaskFailure, run_tasks

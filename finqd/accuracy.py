@@ -160,7 +160,7 @@ class Study:
     @cached_property
     def versions(self) -> dict[str, str]:
         """Versions on which results depend, and the digest of finqd's source."""
-        from finqd.evaluate import versions
+        from finqd.provenance import versions
 
         return dict(versions())
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from finqd import __version__
 from finqd.errors import InputError
 from finqd.mechanics.state import State
+from finqd.provenance import versions
 from finqd.trajectory import DAMAGE, replacing
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class Checkpoint:
         except DAMAGE as error:
             raise InputError("damaged, or not a checkpoint of finqd", where) from error
         if found != fingerprint:
-            raise InputError("is of another simulation: its scene, steps, plugins or version of finqd differ", where)
+            raise InputError("is of another simulation: its scene, steps, plugins, libraries or source differ", where)
         return cls(fingerprint=found, state=state, history=parts["history"], rows=parts["rows"], header=header)
 
 
@@ -96,11 +96,14 @@ def _state(arrays: Mapping[str, np.ndarray]) -> State:
 
 
 def fingerprint(scene: Scene, **settings: Any) -> str:
-    """Return a digest of everything that decides how ``scene`` moves under ``settings``, to the last bit."""
+    """Return a digest of everything that decides how ``scene`` moves under ``settings``, to the last bit.
+
+    Versions of libraries and the state of finqd's source are among it: with others the bits would differ.
+    """
     digest = hashlib.sha256()
     friction = {tuple(sorted(pair)): value for pair, value in scene.pair_friction.items()}
     parts = (
-        __version__, scene.gravity, scene.friction, friction, scene.soft_bodies, scene.rigid_bodies, scene.planes,
+        versions(), scene.gravity, scene.friction, friction, scene.soft_bodies, scene.rigid_bodies, scene.planes,
         settings,
     )
     for piece in _pieces(parts):

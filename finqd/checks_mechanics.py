@@ -222,7 +222,45 @@ def check_obeys_damping(kind: str, name: str) -> None:
     assert abs(left / np.exp(-0.5) - 1.0) < 0.1, f"after half the time constant {left:.2f} of a strain is left"
 
 
-STEPPER = (check_falls_freely, check_holds_what_is_fixed, check_repeats_itself, check_obeys_damping)
+def check_goes_on_from_a_checkpoint(kind: str, name: str) -> None:
+    """A simulation that is stopped and taken up again ends with the same bits: all that steps depend on is kept."""
+    from pathlib import Path
+    from tempfile import TemporaryDirectory
+
+    from finqd.simulate import simulate
+
+    class Stopped(Exception):
+        pass
+
+    def stop(system: System, state: State) -> None:
+        if state.time > 0.025:
+            raise Stopped
+
+    def box_on_plane() -> Scene:
+        scene = _box_scene(height=0.0)
+        scene.add_plane()
+        if kind == "stepper" and not _has_inertia(name):
+            scene.soft_bodies[0].fix("zmax")
+        return scene
+
+    options: dict[str, Any] = {"duration": 0.05, "time_step": 0.01, kind: name}
+    if kind == "stepper":
+        options["contact"] = {"name": "penalty", "stiffness_N_mm3": 1.0}  # those with substeps need few for that
+    whole = _simulated(box_on_plane(), **options)[-1]
+    with TemporaryDirectory() as folder:
+        kept: dict[str, Any] = {"checkpoint": Path(folder) / "run.npz", "checkpoint_every": 0.0}
+        try:
+            simulate(box_on_plane(), watch=stop, **kept, **options)
+        except Stopped:
+            end = _simulated(box_on_plane(), **kept, **options)[-1]
+    assert end.positions.tobytes() == whole.positions.tobytes(), "a run that was stopped ends elsewhere"
+    assert end.velocities.tobytes() == whole.velocities.tobytes(), "a run that was stopped ends at another speed"
+
+
+STEPPER = (
+    check_falls_freely, check_holds_what_is_fixed, check_repeats_itself, check_obeys_damping,
+    check_goes_on_from_a_checkpoint,
+)
 
 
 # -- contact -----------------------------------------------------------------------------------------------------------
@@ -262,7 +300,10 @@ def check_lets_go_of_what_is_apart(kind: str, name: str) -> None:
     assert np.abs(ends[0] - ends[1]).max() < 1e-9, "a plane 0.1 m below acts on a falling box"
 
 
-CONTACT = (check_soft_body_rests_on_a_plane, check_rigid_body_rests_on_a_plane, check_lets_go_of_what_is_apart)
+CONTACT = (
+    check_soft_body_rests_on_a_plane, check_rigid_body_rests_on_a_plane, check_lets_go_of_what_is_apart,
+    check_goes_on_from_a_checkpoint,
+)
 
 
 # -- how it is done ----------------------------------------------------------------------------------------------------

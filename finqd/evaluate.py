@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +20,7 @@ from finqd.grasp import GraspTask, base_height, simulate_grasp
 from finqd.meshing import mesh_solid
 from finqd.objects import GraspObject, load_object, object_names
 from finqd.presets import apply_preset
+from finqd.provenance import versions
 from finqd.trajectory import Trajectory
 from finqd.units import MM
 from finqd.workers import TaskFailure, run_tasks
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
     from finqd.mesh import Mesh
     from finqd.solid import Solid
 
-LIBRARIES = ("finqd", "numpy", "scipy", "numba", "gmsh", "qdldl", "mkl")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,25 +245,6 @@ def _write_record(folder: Path, task: GraspTask, trajectory: Trajectory) -> None
     write_paraview(
         target, trajectory, [body.mesh for body in scene.soft_bodies], [(task.grasped.vertices, task.grasped.triangles)]
     )
-
-
-@cache
-def versions() -> Mapping[str, str]:
-    """Return the versions of finqd and of the libraries that can change a result, and ``source``: `source_digest`."""
-    found = {}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return {**found, "source": source_digest()}
-
-
-def source_digest() -> str:
-    """Return the first digits of a digest of finqd's own source, which changes more often than its version."""
-    package = Path(__file__).parent
-    text = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
-    return hashlib.sha256(text).hexdigest()[:12]
 
 
 def _finite(value: float) -> float | None:

@@ -77,7 +77,7 @@ def settings_of(
 @cache
 def versions() -> Mapping[str, str]:
     """Return the versions that a result depends on."""
-    from finqd.evaluate import versions as versions_of_simulation
+    from finqd.provenance import versions as versions_of_simulation
 
     return {"python": sys.version.split()[0], "ribs": version("ribs"), **versions_of_simulation()}
 

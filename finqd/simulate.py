@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time as clock
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -170,6 +171,7 @@ class _Keeper:
     path: Path
     fingerprint: str
     every: float
+    full: bool = False  # it could not be written
     last: float = field(default_factory=clock.perf_counter)
 
     def look(self, run: _Run) -> None:
@@ -178,21 +180,37 @@ class _Keeper:
             self.save(run)
 
     def save(self, run: _Run) -> None:
-        """Write the run as it is after its last step."""
+        """Write the run as it is after its last step; where that fails, say so once and let the run go on."""
+        if self.full:
+            return
+        try:
+            self._checkpoint(run).save(self.path)
+        except OSError as error:
+            warnings.warn(f"no checkpoint {self.path}: {error.strerror or error}", RuntimeWarning, stacklevel=2)
+            self.full = True
+        self.last = clock.perf_counter()
+
+    def _checkpoint(self, run: _Run) -> Checkpoint:
         rows, control = run.recorder.rows, run.control
         header = {
             "done": run.done, "status": run.status, "reason": run.reason, "counters": run.recorder.counters,
             "largest_penetration": run.recorder.largest_penetration, "halvings": control.halvings,
             "calm": control.calm, "proposed": control.proposed,
         }
-        Checkpoint(
+        return Checkpoint(
             fingerprint=self.fingerprint, state=run.state, history=run.system.history(),
             rows={name: np.array(values) for name, values in rows.items()}, header=header,
-        ).save(self.path)
-        self.last = clock.perf_counter()
+        )
 
     def restore(self, run: _Run) -> bool:
-        """Take the run to where the checkpoint is, if there is one; return whether there is."""
+        """Take the run to where the checkpoint is, if there is one; return whether there is.
+
+        Raises InputError for a file that cannot be a checkpoint of this run, and if there is no place for one.
+        """
+        if not hasattr(run.system.contact, "history"):
+            raise InputError("the contact plugin cannot be stopped: it has no history()", str(self.path))
+        if not self.path.parent.is_dir():
+            raise InputError("its folder does not exist", str(self.path))
         if not self.path.exists():
             return False
         kept = Checkpoint.load(self.path, fingerprint=self.fingerprint)

@@ -87,9 +87,9 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(stepper, tmp_path):
 
 @pytest.mark.parametrize("stepper", ["imex", "explicit"])
 def test_so_does_one_with_substeps(stepper, tmp_path):
-    """A block that slides over the floor; 1 N/mm^3, which needs few substeps."""
+    """A block thrown at the floor; 1 N/mm^3, which needs few substeps."""
 
-    def sliding() -> Scene:
+    def thrown() -> Scene:
         scene = Scene()
         scene.add_plane(name="floor")
         scene.add_soft(box_mesh((0.02, 0.02, 0.02), (1, 1, 1)), RUBBER, velocity=(0.3, 0.0, -0.1))
@@ -97,11 +97,11 @@ def test_so_does_one_with_substeps(stepper, tmp_path):
 
     options = {"stepper": stepper, "contact": {"name": "penalty", "stiffness_N_mm3": 1.0}, "duration": 0.04,
                "time_step": 0.005}
-    whole = kept_run(sliding(), **options)
+    whole = kept_run(thrown(), **options)
     assert whole.status == "ok" and whole.soft_positions[-1, :, 2].min() > -1e-4, "the floor does not carry it"
     with pytest.raises(Stopped):
-        kept_run(sliding(), tmp_path / "run.npz", stop_at=5, **options)
-    assert_same(kept_run(sliding(), tmp_path / "run.npz", **options), whole)
+        kept_run(thrown(), tmp_path / "run.npz", stop_at=5, **options)
+    assert_same(kept_run(thrown(), tmp_path / "run.npz", **options), whole)
 
 
 def test_a_checkpoint_changes_nothing_and_a_finished_one_answers_at_once(tmp_path):
@@ -163,6 +163,28 @@ def test_a_damaged_checkpoint_is_refused_in_one_sentence(tmp_path):
     path.mkdir()
     with pytest.raises(InputError, match="cannot be read"):
         kept_run(pads(), path)
+
+
+def test_a_checkpoint_that_cannot_be_written_does_not_end_the_run(tmp_path, monkeypatch):
+    def full(self, path):
+        raise OSError(28, "No space left on device")
+
+    whole = kept_run(pads())
+    monkeypatch.setattr("finqd.checkpoint.Checkpoint.save", full)
+    with pytest.warns(RuntimeWarning, match="No space left") as told:
+        found = kept_run(pads(), tmp_path / "run.npz")
+    assert_same(found, whole)
+    assert len(told) == 1
+    with pytest.raises(InputError, match="folder does not exist"):
+        kept_run(pads(), tmp_path / "nowhere" / "run.npz")
+
+
+def test_other_libraries_or_another_source_are_another_simulation(tmp_path, monkeypatch):
+    """They would not give the same bits; a matrix of one solver library is of no use to another."""
+    kept_run(pads(), tmp_path / "run.npz")
+    monkeypatch.setattr("finqd.checkpoint.versions", lambda: {"finqd": "0.1.0", "source": "another"})
+    with pytest.raises(InputError, match="another simulation"):
+        kept_run(pads(), tmp_path / "run.npz")
 
 
 def test_a_grasp_that_ran_out_of_time_goes_on_from_its_folder(run, tmp_path):

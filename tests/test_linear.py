@@ -156,7 +156,7 @@ def test_a_lagged_preconditioner_serves_a_changed_system(backend):
     system = System(7, bodies=1)
     solver = make_solver(system.pattern, backend=backend, tolerance=1e-9, refactor_cost=20.0)
     first = system.solve(solver)
-    assert first.factorised and first.iterations <= 2  # in single precision one more
+    assert first.factorised and first.iterations == 1 + (backend == "pardiso")  # which is in single precision
     system.blocks *= 1.05
     system.add(10.0 * np.outer(_contact(system, 20), _contact(system, 20)), 20)
     second = system.solve(solver)
@@ -176,10 +176,11 @@ def test_a_useless_preconditioner_is_replaced_in_the_same_solve():
     solver = make_solver(first.pattern, tolerance=1e-10, refactor_cost=6.0)
     first.solve(solver)
     solution = second.solve(solver)
-    assert solution.factorised and solution.iterations in (7, 8) and solution.converged
+    single = available_backends()[0] == "pardiso"  # then it takes two iterations to 1e-10, else one
+    assert solution.factorised and solution.iterations == 7 + single and solution.converged
     assert error(solution, second.exact) < 1e-8
     again = second.solve(solver)
-    assert not again.factorised and again.iterations <= 2
+    assert not again.factorised and again.iterations == 1 + single
 
 
 class Rounded(QdldlFactorisation):

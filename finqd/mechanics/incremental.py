@@ -152,11 +152,13 @@ class Increment:
         return still if self.energy(still) < energy else moving
 
     def _start(self, velocities: np.ndarray, rigid_velocities: np.ndarray, momenta: np.ndarray) -> State:
-        """Return the start moved by these for the whole step, or as far as contact lets it go."""
-        start, system = self.start, self.system
+        """Return where the formula ends with these velocities, or as far on the way as contact lets it go."""
+        start, system, past = self.start, self.system, self.past
         spins = _spins(system, system.world_inertias(start.rigid_rotations), momenta)
+        shifts = past.rigid_origin + past.h * rigid_velocities - start.rigid_positions
         direction = Direction(
-            soft=self.dt * velocities, rigid=self.dt * np.concatenate([rigid_velocities, spins], axis=1)
+            soft=past.origin + past.h * velocities - start.positions,
+            rigid=np.concatenate([shifts, self.dt * spins], axis=1),
         )
         return self._driven(start.moved(direction, min(1.0, system.contact.step_limit(start, direction))))
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from finqd.mechanics.linear import Preconditioner
 from finqd.mechanics.linear_kernels import dot
+from finqd.mechanics.preconditioners import Preconditioner
 from finqd.mechanics.state import Direction
 from finqd.mechanics.system import Derivatives
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -11,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from finqd.mechanics import contact_force_kernels as forces
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.contact_rows import FrictionRows, KeyedValues, Rows
-from finqd.mechanics.contact_surface import contact_surface
+from finqd.mechanics.contact_surface import ContactSurface, contact_surface
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
 from finqd.mechanics.rounding import rounded_field
@@ -20,10 +22,14 @@ from finqd.mechanics.system import Derivatives
 from finqd.scene import Scene
 from finqd.units import MM
 
+if TYPE_CHECKING:
+    from finqd.objects import GraspObject
+
 SUPPORT_AREA = 1.0 * MM**2  # a point on which a rigid body stands is at least as stiff as this area of a soft face
 SUPPORT_ALLOWANCE = 2.0  # multiples of `weight_penetration_mm` that such a point may move into a plane in one iteration
-FINE = 0.005  # samples need not be nearer than this share of the smallest body's radius,
-PLANE_CELLS = 8  # nor more along an edge of a face than these if all there is are planes
+FITTING = 0.3  # [mm] spacing of samples that fits bodies of up to
+THICK = 60.0 * MM  # this thickness; for thicker ones it grows with them
+PLANE_CELLS = 8  # samples of that spacing along an edge of a face are no more than these if all there is are planes
 LEAST_SHARE = 0.4  # of the way to their new values that friction bounds go at least in a renewal
 
 
@@ -33,8 +39,8 @@ class Penalty:
 
     stiffness_N_mm3: pressure a penetration [N/mm^2 per mm]
     smoothing_mm: penetration over which the stiffness sets in
-    sample_spacing_mm: largest distance of the points on soft faces that feel contact; larger in scenes without bodies
-        smaller than 60 mm across the radius: `FINE`, `PLANE_CELLS`
+    sample_spacing_mm: largest distance of the points on soft faces that feel contact; in proportion more where the
+        thinnest rigid body is thicker than 60 mm (see `thickness`), and on large faces where there are only planes
     edge_radius_mm: with which sharp edges of rigid bodies count as rounded where soft faces touch them
     friction_stiffness_ratio: tangential over normal stiffness
     step_allowance_mm: how far a point may move into a body in one Newton step
@@ -65,11 +71,7 @@ class PenaltyContact:
         self.options, self.scene = options, scene
         self.stiffness = options.stiffness_N_mm3 / MM**3
         shapes = [body.shape for body in scene.rigid_bodies]
-        smallest = min((shape.bounding_radius for shape in shapes), default=0.0)
-        self.surface = contact_surface(
-            scene.soft_bodies, spacing=max(options.sample_spacing_mm * MM, FINE * smallest),
-            most_cells=None if shapes else PLANE_CELLS,
-        )
+        self.surface = self._surface(shapes)
         touching = len(self.surface.faces) > 0
         self.fields = [rounded_field(s, options.edge_radius_mm * MM) if touching else s.distance for s in shapes]
         # under weightless conditions a body still must not sink into a plane: 1 g stands in for gravity
@@ -90,6 +92,15 @@ class PenaltyContact:
         self._missing: KeyedValues | None = None  # what the last renewal of this step found missing in the bounds [N]
         self._share = 1.0  # of which it took that share
         self._rows_state: State | None = None
+
+    def _surface(self, shapes: Sequence[GraspObject]) -> ContactSurface:
+        """Return the soft faces with points as dense as ``shapes`` call for; the option scales them in any case."""
+        share = self.options.sample_spacing_mm / FITTING
+        spacing = self.options.sample_spacing_mm * MM
+        if not shapes:  # planes are met by corners
+            return contact_surface(self.scene.soft_bodies, spacing=spacing, most_cells=math.ceil(PLANE_CELLS / share))
+        thinnest = min(thickness(shape) for shape in shapes)
+        return contact_surface(self.scene.soft_bodies, spacing=spacing * max(1.0, thinnest / THICK))
 
     def _lay_out_keys(self) -> None:
         """Number all possible contacts: ``first_key`` of each pair, and friction by `_coefficients`."""
@@ -334,6 +345,13 @@ class PenaltyContact:
                 state.positions, *samples, plane.point, plane.normal, self.first_key["plane", p], *rows.arrays, count,
             )
         return count
+
+
+def thickness(shape: GraspObject) -> float:
+    """Return six volumes over the surface [m]: a ball's diameter, a cube's edge, three radii of a long wire."""
+    a, b, c = (shape.vertices[shape.triangles[:, i]] for i in range(3))
+    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return 6.0 * shape.volume / area
 
 
 def _pose(state: State, r: int) -> tuple[np.ndarray, np.ndarray]:

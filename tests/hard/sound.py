@@ -39,7 +39,6 @@ class Course:
         self.kinetic.append(kinetic_energy(system, state))
         self.energies.append(self.kinetic[-1] + system.energy(state))
 
-
     def longest_way(self) -> float:
         """Return how far anything has gone [m]."""
         ways = [0.0]
@@ -81,6 +80,8 @@ def sound(
         energies = np.array(course.energies)
         size = np.ptp(energies) + max(course.kinetic)
         won = np.max(energies - np.minimum.accumulate(energies))
-        allowed = GAIN[options.get("stepper", "implicit_euler")] * size + UNBALANCED_N * course.longest_way()
+        stepper = options.get("stepper")
+        share = GAIN[stepper if isinstance(stepper, str) else "implicit_euler"]
+        allowed = share * size + UNBALANCED_N * course.longest_way()
         assert won <= allowed, f"{won:.3g} J out of nothing, of {size:.3g} J"
     return found, course

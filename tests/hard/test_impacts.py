@@ -39,4 +39,4 @@ def test_a_ball_thrown_at_a_soft_wall_at_10_m_per_s(diameter_mm, step, stepper, 
     for state in course.states:
         middle = state.positions[wall.vertices("xmax")][:, 0].max()
         assert state.rigid_positions[0, 0] < middle, "it went through"
-    assert course.states[-1].rigid_velocities[0, 0] < 10.0
+    assert course.states[-1].rigid_velocities[0, 0] < 5.0, "the wall hardly slows it"

@@ -1,0 +1,30 @@
+"""What a result was made with: versions of libraries, and the state of finqd's own source."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+LIBRARIES = ("finqd", "numpy", "scipy", "numba", "gmsh", "qdldl", "mkl")
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """Return the versions of finqd and of the libraries that can change a result, and ``source``: `source_digest`."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return {**found, "source": source_digest()}
+
+
+def source_digest() -> str:
+    """Return the first digits of a digest of finqd's own source, which changes more often than its version."""
+    package = Path(__file__).parent
+    text = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
+    return hashlib.sha256(text).hexdigest()[:12]
