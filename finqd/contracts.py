@@ -130,6 +130,12 @@ class ContactPotential(Protocol):
     soft_forces: normal force on each soft body at the last committed state [N], shape (n_soft,)
     relagged_forces: the same at the state of the last `relag`
     penetration: largest at the last committed state [m]
+
+    One that couples vertices of different faces, as contact of soft bodies with each other does, has in addition
+    ``couplings(state)``: it is asked before each `add_hessian`, and returns the pairs of vertices, (n, 2), that the
+    Hessian at ``state`` needs and the last bound pattern does not have (`BlockPattern.lacks`). Then `bind` is called
+    anew, with a pattern that has them as well. Patterns never shrink, and each growth costs a symbolic factorisation:
+    pairs that are merely near are best asked for together.
     """
 
     soft_forces: np.ndarray

@@ -205,6 +205,7 @@ def contact_rate(system: System, state: State) -> float:
     A (soft; bounded by row sums) plus that of C (rigid; six unknowns a body).
     """
     d = system.derivatives
+    system.find_couplings(state)
     d.clear_hessian()
     system.contact.add_hessian(state, d, projected=True)
     scale = np.where(system.fixed | (system.masses <= 0.0)[:, None], 0.0, system.masses[:, None])

@@ -224,6 +224,7 @@ class Increment:
     def rigid_hessian(self, state: State) -> None:
         """Fill the rigid bodies' part of the Hessian alone, and what couples them to soft vertices; spoil the rest."""
         system, d = self.system, self.system.derivatives
+        system.find_couplings(state)
         d.coupling[:] = 0.0
         d.rigid_matrix[:] = 0.0
         system.contact.add_hessian(state, d)

@@ -71,6 +71,12 @@ class BlockPattern:
         upper = np.where(one <= other, found, self.n_blocks)
         return np.where(valid, upper, -1).astype(np.int32)
 
+    def lacks(self, pairs: np.ndarray) -> np.ndarray:
+        """Return which ``pairs`` of vertices, shape (n, 2), have no block, shape (n,)."""
+        rows = np.repeat(np.arange(self.n_vertices, dtype=np.int64), np.diff(self.indptr))
+        wanted = np.sort(np.asarray(pairs, dtype=np.int64), axis=1) @ np.array([self.n_vertices, 1])
+        return ~np.isin(wanted, rows * self.n_vertices + self.indices)
+
     def matrix(self, blocks: np.ndarray) -> sp.bsr_array:
         """Return the symmetric matrix of ``blocks`` (n_blocks + 1, 3, 3), sparse, (3 n_vertices, 3 n_vertices)."""
         n, blocks = 3 * self.n_vertices, blocks[: self.n_blocks]

@@ -79,12 +79,10 @@ class System:
         self.potentials = [b.elasticity.potential(b.mesh, b.material, first_vertex=b.first_vertex) for b in soft]
         self.damping = damping_of(soft, own, self.masses)
         viscous = () if self.damping is None else self.damping.cliques
-        self.pattern = BlockPattern.from_cliques(n, [*(c for p in self.potentials for c in p.cliques), *viscous])
-        self.slots = [tuple(self.pattern.slots(c) for c in p.cliques) for p in self.potentials]
+        self._cliques = [*(c for p in self.potentials for c in p.cliques), *viscous]
+        self._couplings = np.zeros((0, 2), dtype=np.int64)  # pairs of vertices that contact has coupled beside these
         self.contact = contact.potential(scene)
-        self.contact.bind(self.pattern)
-        if self.damping is not None:
-            self.damping.bind(self.pattern)
+        self._lay_out()
         self.derivatives = Derivatives(
             soft=np.zeros((n, 3)), rigid=np.zeros((m, 6)), blocks=self.pattern.new_blocks(),
             coupling=np.zeros((3 * n, 6 * m)), rigid_matrix=np.zeros((6 * m, 6 * m)),
@@ -99,6 +97,21 @@ class System:
         self._solvers: dict[str, LinearSolver] = {}  # of the steppers, by their settings
         self._histories: dict[str, dict[str, np.ndarray]] = {}  # of solvers that have not been asked for yet
 
+    def _lay_out(self) -> None:
+        """Find the sparsity of the soft Hessian, and tell everyone where their entries go."""
+        self.pattern = BlockPattern.from_cliques(self.n_vertices, [*self._cliques, self._couplings])
+        self.slots = [tuple(self.pattern.slots(c) for c in p.cliques) for p in self.potentials]
+        self.contact.bind(self.pattern)
+        if self.damping is not None:
+            self.damping.bind(self.pattern)
+
+    def _couple(self, pairs: np.ndarray) -> None:
+        """Let ``pairs`` of vertices (n, 2) have entries in the soft Hessian from now on; solvers begin anew."""
+        self._couplings = np.unique(np.concatenate([self._couplings, np.sort(pairs, axis=1)]), axis=0)
+        self._lay_out()
+        self.derivatives.blocks = self.pattern.new_blocks()
+        self._solvers, self._histories = {}, {}
+
     def solver(self, settings: tuple, make: Callable[[], LinearSolver]) -> LinearSolver:
         """Return the solver with these ``settings``, made if there is none yet: what it lags goes from step to step."""
         key = repr(settings)
@@ -111,7 +124,8 @@ class System:
     def history(self) -> dict[str, np.ndarray]:
         """Return by name what the next steps depend on beside the state: contact's history, and the solvers'."""
         solvers = {**{key: solver.history() for key, solver in self._solvers.items()}, **self._histories}
-        parts = {"contact": self.contact.history(), **{f"solver {key}": part for key, part in solvers.items()}}
+        own = {"couplings": self._couplings}
+        parts = {"pattern": own, "contact": self.contact.history(), **{f"solver {key}": part for key, part in solvers.items()}}
         return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
 
     def restore(self, history: Mapping[str, np.ndarray]) -> None:
@@ -120,6 +134,9 @@ class System:
         for path, value in history.items():
             part, _, name = path.rpartition("/")
             parts.setdefault(part, {})[name] = value
+        couplings = parts.pop("pattern")["couplings"]
+        if len(couplings):
+            self._couple(couplings)
         self.contact.restore(parts.pop("contact"))
         self._histories = {part.removeprefix("solver "): values for part, values in parts.items()}
         self._solvers = {}
@@ -202,11 +219,19 @@ class System:
         return energy + self._elastic_energy + self.contact.add_gradient(state, d)
 
     def add_hessian(self, state: State, *, projected: bool = False) -> None:
-        """Add the Hessian of `energy` to `derivatives`; ``projected``: a positive semidefinite one."""
+        """Add the Hessian of `energy` to `derivatives`, cleared before; ``projected``: a positive semidefinite one."""
         d = self.derivatives
+        self.find_couplings(state)
         for potential, slots in zip(self.potentials, self.slots, strict=True):
             potential.add_hessian(state.positions, slots, d.blocks, projected=projected)
         self.contact.add_hessian(state, d, projected=projected)
+
+    def find_couplings(self, state: State) -> None:
+        """Make room in the soft Hessian for all that contact couples at ``state``; an empty one takes its place."""
+        if hasattr(self.contact, "couplings"):
+            pairs = self.contact.couplings(state)
+            if len(pairs):
+                self._couple(pairs)
 
     def hold_fixed(self) -> None:
         """Make held degrees of freedom drop out of the Hessian."""

@@ -59,15 +59,16 @@ class LinearlyImplicit:
 
     def __init__(self, system: System, state: State, solver: LinearSolver, damping: float) -> None:
         self.system, self.solver, self.damping = system, solver, damping
+        self.pattern = system.pattern  # contact may make the system's grow
         self.stiffness = np.zeros_like(system.derivatives.blocks)
         for potential, slots in zip(system.potentials, system.slots, strict=True):
             potential.add_hessian(state.positions, slots, self.stiffness, projected=True)
-        self.product = system.pattern.matrix(self.stiffness)
+        self.product = self.pattern.matrix(self.stiffness)
         self.viscosity, self.resistance = None, None
         if system.damping is not None and system.damping.viscous:
             self.viscosity = np.zeros_like(self.stiffness)
             system.damping.add_viscosity(state.positions, self.viscosity)
-            self.resistance = system.pattern.matrix(self.viscosity)
+            self.resistance = self.pattern.matrix(self.viscosity)
         self.blocks, self.h = self.stiffness, 0.0
         self.cg_iterations = self.factorisations = 0
 
@@ -101,5 +102,5 @@ class LinearlyImplicit:
         self.blocks, self.h = h * h * self.stiffness, h
         if self.viscosity is not None:
             self.blocks += h * self.viscosity
-        add_diagonal(system.pattern.indptr, system.masses, self.blocks)
-        hold(system.pattern.indptr, system.pattern.indices, system.fixed, self.blocks, np.zeros((0, 0)))
+        add_diagonal(self.pattern.indptr, system.masses, self.blocks)
+        hold(self.pattern.indptr, self.pattern.indices, system.fixed, self.blocks, np.zeros((0, 0)))
