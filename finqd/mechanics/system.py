@@ -124,8 +124,8 @@ class System:
     def history(self) -> dict[str, np.ndarray]:
         """Return by name what the next steps depend on beside the state: contact's history, and the solvers'."""
         solvers = {**{key: solver.history() for key, solver in self._solvers.items()}, **self._histories}
-        own = {"couplings": self._couplings}
-        parts = {"pattern": own, "contact": self.contact.history(), **{f"solver {key}": part for key, part in solvers.items()}}
+        parts = {"pattern": {"couplings": self._couplings}, "contact": self.contact.history()}
+        parts |= {f"solver {key}": part for key, part in solvers.items()}
         return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
 
     def restore(self, history: Mapping[str, np.ndarray]) -> None:
