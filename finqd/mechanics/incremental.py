@@ -158,7 +158,7 @@ class Increment:
         shifts = past.rigid_origin + past.h * rigid_velocities - start.rigid_positions
         direction = Direction(
             soft=past.origin + past.h * velocities - start.positions,
-            rigid=np.concatenate([shifts, self.dt * spins], axis=1),
+            rigid=np.where(system.rigid_held[:, None], 0.0, np.concatenate([shifts, self.dt * spins], axis=1)),
         )
         return self._driven(start.moved(direction, min(1.0, system.contact.step_limit(start, direction))))
 
