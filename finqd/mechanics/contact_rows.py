@@ -8,6 +8,8 @@ import numpy as np
 
 from finqd.mechanics.state import State
 
+LEAST_SHARE = 0.4  # of the way to their new values that friction bounds go at least in a renewal
+
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionRows:
@@ -61,6 +63,52 @@ class KeyedValues:
         return found
 
 
+class FrictionBounds:
+    """Lagged friction bounds mu N [N] by key, ``values``; renewed within a step, towards what normal forces ask for."""
+
+    def __init__(self) -> None:
+        self.values = KeyedValues(keys=np.zeros(0, dtype=np.int64), values=np.zeros(0))
+        self._missing: KeyedValues | None = None  # what the last renewal of this step found missing [N]
+        self._share = 1.0  # of which it took that share
+
+    def begin(self) -> None:
+        """Begin a step: renewals before do not matter any more."""
+        self._missing = None
+
+    def renew(self, keys: np.ndarray, wanted: np.ndarray, *, whole: bool) -> float:
+        """Go to the bounds ``wanted`` [N] at ``keys``, zero elsewhere; return which share of all, in sum, was missing.
+
+        ``whole``: without relaxation.
+        """
+        goal = KeyedValues.of(keys, wanted)
+        of_both = np.union1d(goal.keys, self.values.keys)
+        missing = goal.at(of_both) - self.values.at(of_both)
+        total = max(float(np.sum(goal.values)), float(np.sum(self.values.values)))
+        self.values = goal if whole else self._relaxed(KeyedValues(keys=of_both, values=missing))
+        return float(np.sum(np.abs(missing))) / total if total > 0.0 else 0.0
+
+    def _relaxed(self, missing: KeyedValues) -> KeyedValues:
+        """Return the bounds to go on with, between the last ones and those that normal forces ask for.
+
+        missing: what they ask for more, at all keys of both. Where friction carries much of the load, full renewals
+        swing about Coulomb's law for ever: more friction, less normal force, less friction. Aitken's relaxation finds
+        the middle; the first renewal of a step is a full one.
+        Source: Kuettler and Wall, Comput. Mech. 43 (2008) 61, equation 44.
+        """
+        before, self._missing = self._missing, missing
+        if before is None:
+            self._share = 1.0
+        else:
+            keys = np.union1d(missing.keys, before.keys)
+            turn = missing.at(keys) - before.at(keys)
+            size = float(np.vdot(turn, turn))
+            if size > 0.0:
+                share = -self._share * float(np.vdot(before.at(keys), turn)) / size
+                self._share = min(max(share, LEAST_SHARE), 1.0)
+        bounds = self.values.at(missing.keys) + self._share * missing.values
+        return KeyedValues(keys=missing.keys, values=np.maximum(bounds, 0.0))
+
+
 class Rows:
     """Contacts at one state: ``count`` of at most ``capacity`` rows are in use; columns as in `contact_kernels`."""
 
@@ -95,11 +143,11 @@ class Rows:
         return stiffness * np.where(depth < smoothing, depth**2 / (2.0 * smoothing), depth - 0.5 * smoothing)
 
     def friction(
-        self, *, state: State, start: State, faces: np.ndarray, bound: np.ndarray, slips: KeyedValues, ratio: float
+        self, *, state: State, start: State, faces: np.ndarray, bound: np.ndarray, slip: np.ndarray, ratio: float
     ) -> FrictionRows:
         """Return the frictional contacts among the rows found at ``state``, referred to ``start``.
 
-        bound: lagged mu N [N] of each row; slips: stored elastic slip [m] by key, in the frame of the rigid body;
+        bound: lagged mu N [N] of each row; slip: its stored elastic slip [m], in the frame of the rigid body;
         ratio: tangential over normal stiffness.
         """
         used = np.flatnonzero(bound > 0.0)
@@ -108,7 +156,7 @@ class Rows:
         soft = face >= 0
         nodes = faces[face[soft]]
         point[soft] = np.einsum("na,nax->nx", np.where(nodes >= 0, weight[soft], 0.0), start.positions[nodes])
-        arm, slip = self.arm[used], slips.at(key)
+        arm, slip = self.arm[used], slip[used]
         for r in range(len(start.rigid_positions)):
             mine = rigid == r
             turning = mine & (self.turns[used] != 0)  # a ball touches a plane with its lowest point, however it turns

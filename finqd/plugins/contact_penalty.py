@@ -12,11 +12,12 @@ from annotated_types import Ge, Gt, Le
 
 from finqd.mechanics import contact_force_kernels as forces
 from finqd.mechanics import contact_kernels as kernels
-from finqd.mechanics.contact_rows import FrictionRows, KeyedValues, Rows
+from finqd.mechanics.contact_rows import FrictionBounds, FrictionRows, KeyedValues, Rows
 from finqd.mechanics.contact_surface import ContactSurface, contact_surface
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
 from finqd.mechanics.rounding import rounded_field
+from finqd.mechanics.soft_contact import SoftContact
 from finqd.mechanics.state import Direction, State
 from finqd.mechanics.system import Derivatives
 from finqd.scene import Scene
@@ -30,7 +31,7 @@ SUPPORT_ALLOWANCE = 2.0  # multiples of `weight_penetration_mm` that such a poin
 FITTING = 0.3  # [mm] spacing of samples that fits bodies of up to
 THICK = 60.0 * MM  # this thickness; for thicker ones it grows with them
 PLANE_CELLS = 8  # samples of that spacing along an edge of a face are no more than these if all there is are planes
-LEAST_SHARE = 0.4  # of the way to their new values that friction bounds go at least in a renewal
+FACE_SHARE = 0.1  # of the size of soft faces that they keep apart from each other at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +46,9 @@ class Penalty:
     friction_stiffness_ratio: tangential over normal stiffness
     step_allowance_mm: how far a point may move into a body in one Newton step
     weight_penetration_mm: how far a rigid body sinks into the floor at most on one support point under its own weight
+    soft_contact: whether soft bodies touch each other and themselves
+    soft_gap_mm: distance at which their faces begin to push each other apart, at most a tenth of the faces' size: a
+        barrier keeps points on them from ever passing through
     """
 
     stiffness_N_mm3: Annotated[float, Gt(0), Le(1e6)] = 300.0
@@ -54,6 +58,8 @@ class Penalty:
     friction_stiffness_ratio: Annotated[float, Gt(0), Le(10)] = 0.5
     step_allowance_mm: Annotated[float, Gt(0), Le(10)] = 0.5
     weight_penetration_mm: Annotated[float, Gt(0), Le(1)] = 0.01
+    soft_contact: bool = True
+    soft_gap_mm: Annotated[float, Gt(0), Le(10)] = 0.1
 
     def potential(self, scene: Scene) -> PenaltyContact:
         """Return the potential of every pair in ``scene`` that can touch."""
@@ -79,18 +85,17 @@ class PenaltyContact:
         self.support_stiffness = [
             max(s.mass * weight / (options.weight_penetration_mm * MM), self.stiffness * SUPPORT_AREA) for s in shapes
         ]
+        self.soft = self._soft_contact()
         self._lay_out_keys()
         self.rows = Rows(256, self.surface.faces.shape[1])
         self.friction = FrictionRows.empty(self.surface.faces.shape[1])
         nothing = np.zeros(0, dtype=np.int64)
         self.slips = KeyedValues(keys=nothing, values=np.zeros((0, 3)))
-        self.bounds = KeyedValues(keys=nothing, values=np.zeros(0))  # lagged mu N [N]
+        self.bounds = FrictionBounds()
         self.soft_forces = np.zeros(len(scene.soft_bodies))
         self.relagged_forces = self.soft_forces
         self.penetration = 0.0
         self.start: State | None = None
-        self._missing: KeyedValues | None = None  # what the last renewal of this step found missing in the bounds [N]
-        self._share = 1.0  # of which it took that share
         self._rows_state: State | None = None
 
     def _surface(self, shapes: Sequence[GraspObject]) -> ContactSurface:
@@ -101,6 +106,15 @@ class PenaltyContact:
             return contact_surface(self.scene.soft_bodies, spacing=spacing, most_cells=math.ceil(PLANE_CELLS / share))
         thinnest = min(thickness(shape) for shape in shapes)
         return contact_surface(self.scene.soft_bodies, spacing=spacing * max(1.0, thinnest / THICK))
+
+    def _soft_contact(self) -> SoftContact | None:
+        """Return the contact of soft faces with each other, None if there is none."""
+        options, areas = self.options, self.surface.face_area
+        if not options.soft_contact or not len(areas):
+            return None
+        gap = min(options.soft_gap_mm * MM, FACE_SHARE * math.sqrt(float(np.median(areas))))
+        ratio = options.friction_stiffness_ratio
+        return SoftContact(self.scene, self.surface, gap=gap, pressure=self.stiffness, ratio=ratio)
 
     def _lay_out_keys(self) -> None:
         """Number all possible contacts: ``first_key`` of each pair, and friction by `_coefficients`."""
@@ -120,6 +134,7 @@ class PenaltyContact:
                 starts.append(count)
                 self._pair_friction.append([scene.friction_between(rigid.name, plane.name)])
                 count += max(len(rigid.shape.support_points), 1)
+        self.first_key["soft", 0] = count
         self._starts = np.array(starts, dtype=np.int64)
 
     def _coefficients(self) -> np.ndarray:
@@ -135,12 +150,20 @@ class PenaltyContact:
 
     def bind(self, pattern: BlockPattern) -> None:
         """Look up where in the Hessian's blocks each face's pairs of vertices go."""
-        self.face_slots = pattern.slots(self.surface.faces)
+        self.pattern, self.face_slots = pattern, pattern.slots(self.surface.faces)
+        if self.soft is not None:
+            self.soft.bind(pattern)
+
+    def couplings(self, state: State) -> np.ndarray:
+        """Return the pairs of vertices (n, 2) that soft faces in touch couple and the pattern does not have yet."""
+        if self.soft is None:
+            return np.zeros((0, 2), dtype=np.int64)
+        return self.soft.couplings(state.positions, self.pattern)
 
     def begin_step(self, state: State) -> None:
         """Take reference points and normals, and the friction bounds, from ``state``, the start of a step."""
         self.start = state
-        self._missing = None
+        self.bounds.begin()
         self.relag(state, whole=True)
 
     def relag(self, state: State, *, whole: bool = False) -> float:
@@ -151,40 +174,21 @@ class PenaltyContact:
         self._find(state)
         rows = self.rows
         force = rows.forces(self.options.smoothing_mm * MM)
-        keys = rows.key[: rows.count].copy()
-        wanted = KeyedValues.of(keys, self._coefficients() * force)
-        keys_of_both = np.union1d(wanted.keys, self.bounds.keys)
-        missing = wanted.at(keys_of_both) - self.bounds.at(keys_of_both)
-        total = max(float(np.sum(wanted.values)), float(np.sum(self.bounds.values)))
-        change = float(np.sum(np.abs(missing))) / total if total > 0.0 else 0.0
-        self.bounds = wanted if whole else self._relaxed(KeyedValues(keys=keys_of_both, values=missing))
-        self.relagged_forces = self._forces_by_body(force)
+        keys, wanted = rows.key[: rows.count].copy(), self._coefficients() * force
+        if self.soft is not None:
+            self.soft.find(state.positions)
+            keys = np.concatenate([keys, self.soft.keys + self.first_key["soft", 0]])
+            wanted = np.concatenate([wanted, self.soft.row_coefficients() * self.soft.forces()])
+        change = self.bounds.renew(keys, wanted, whole=whole)
+        self.relagged_forces = self._forces_by_body(force, all_of_them=True)
+        bound, slips = self.bounds.values.at(keys), self.slips.at(keys)
         self.friction = rows.friction(
-            state=state, start=self.start, faces=self.surface.faces, bound=self.bounds.at(keys), slips=self.slips,
-            ratio=self.options.friction_stiffness_ratio,
+            state=state, start=self.start, faces=self.surface.faces, bound=bound[: rows.count],
+            slip=slips[: rows.count], ratio=self.options.friction_stiffness_ratio,
         )
+        if self.soft is not None:
+            self.soft.lag(self.start, bound=bound[rows.count :], slips=slips[rows.count :])
         return change
-
-    def _relaxed(self, missing: KeyedValues) -> KeyedValues:
-        """Return the friction bounds to go on with, between the last ones and those that the normal forces ask for.
-
-        missing: what they ask for more, at all keys of both. Where friction carries much of the load, full renewals
-        swing about Coulomb's law for ever: more friction, less normal force, less friction. Aitken's relaxation finds
-        the middle; the first renewal of a step is a full one.
-        Source: Kuettler and Wall, Comput. Mech. 43 (2008) 61, equation 44.
-        """
-        before, self._missing = self._missing, missing
-        if before is None:
-            self._share = 1.0
-        else:
-            keys = np.union1d(missing.keys, before.keys)
-            turn = missing.at(keys) - before.at(keys)
-            size = float(np.vdot(turn, turn))
-            if size > 0.0:
-                share = -self._share * float(np.vdot(before.at(keys), turn)) / size
-                self._share = min(max(share, LEAST_SHARE), 1.0)
-        bounds = self.bounds.at(missing.keys) + self._share * missing.values
-        return KeyedValues(keys=missing.keys, values=np.maximum(bounds, 0.0))
 
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J]."""
@@ -193,16 +197,20 @@ class PenaltyContact:
         rows, friction = self.rows, self.friction
         energy = forces.normal_contacts_energy(rows.gap, rows.stiffness, smoothing, rows.count)
         slips = self._trial_slips(state)
-        return energy + forces.friction_energy(slips, friction.bound, friction.stiffness, len(slips))
+        energy += forces.friction_energy(slips, friction.bound, friction.stiffness, len(slips))
+        return energy if self.soft is None else energy + self.soft.energy(state.positions)
 
     def add_gradient(self, state: State, derivatives: Derivatives) -> float:
         """Add the gradient, return the energy [J]; friction at the lagged bounds."""
         energy, slips = self._add(state, derivatives, gradient=True)
-        return energy + forces.friction_energy(slips, self.friction.bound, self.friction.stiffness, len(slips))
+        energy += forces.friction_energy(slips, self.friction.bound, self.friction.stiffness, len(slips))
+        return energy if self.soft is None else energy + self.soft.add_gradient(state.positions, derivatives.soft)
 
     def add_hessian(self, state: State, derivatives: Derivatives, *, projected: bool = False) -> None:
         """Add the Hessian; ``projected``: a semidefinite one, exact for friction, Gauss-Newton for the penalty."""
         self._add(state, derivatives, gradient=False, exact=not projected)
+        if self.soft is not None:
+            self.soft.add_hessian(state.positions, derivatives, projected=projected)
 
     def _add(
         self, state: State, d: Derivatives, *, gradient: bool, exact: bool = False
@@ -252,7 +260,7 @@ class PenaltyContact:
                 heights = (state.rigid_positions[r] + arms - plane.point) @ plane.normal
                 hard = SUPPORT_ALLOWANCE * self.options.weight_penetration_mm * MM
                 limit = min(limit, kernels.plane_step_limit(heights, -moves @ plane.normal, hard))
-        return limit
+        return limit if self.soft is None else self.soft.step_limit(state, direction, limit)
 
     def commit(self, state: State) -> None:
         """Accept ``state``: return mapping of the elastic slip; forces and penetration for the outside."""
@@ -263,6 +271,11 @@ class PenaltyContact:
             mine = friction.rigid == r
             slips[mine] = slips[mine] @ state.rigid_rotations[r]
         self.slips = KeyedValues.of(friction.key, slips)
+        if self.soft is not None:
+            soft = self.soft.mapped_slips(state.positions)
+            keys = np.concatenate([friction.key, soft.keys + self.first_key["soft", 0]])
+            self.slips = KeyedValues.of(keys, np.concatenate([slips, soft.values]))
+            self.soft.find(state.positions)
         self._find(state)
         rows = self.rows
         self.soft_forces = self._forces_by_body(rows.forces(self.options.smoothing_mm * MM))
@@ -273,19 +286,31 @@ class PenaltyContact:
         return {
             "slip_keys": self.slips.keys, "slips": self.slips.values, "soft_forces": self.soft_forces,
             "penetration": np.array(self.penetration),
+            "coupled": np.zeros(0, dtype=np.int64) if self.soft is None else self.soft.coupled,
         }
 
     def restore(self, history: dict[str, np.ndarray]) -> None:
         """Go on with a `history`."""
         self.slips = KeyedValues(keys=history["slip_keys"], values=history["slips"])
         self.soft_forces, self.penetration = history["soft_forces"], float(history["penetration"])
+        if self.soft is not None:
+            self.soft.restore(history["coupled"], self.pattern)
 
-    def _forces_by_body(self, force: np.ndarray) -> np.ndarray:
-        """Return the summed normal force on each soft body [N], from that of each row."""
+    def _forces_by_body(self, force: np.ndarray, *, all_of_them: bool = False) -> np.ndarray:
+        """Return the summed normal force on each soft body [N], from that of each row, and of soft contacts.
+
+        What a body's own faces do to each other is left out, unless ``all_of_them`` is wanted.
+        """
         face = self.rows.face[: self.rows.count]
         soft = face >= 0
         bodies = self.surface.face_body[face[soft]]
-        return np.bincount(bodies, force[soft], minlength=len(self.scene.soft_bodies)).astype(float)
+        n = len(self.scene.soft_bodies)
+        found = np.bincount(bodies, force[soft], minlength=n).astype(float)
+        if self.soft is not None and self.soft.rows.count:
+            one, other = self.soft.bodies()
+            force = np.where((one != other) | all_of_them, self.soft.forces(), 0.0)
+            found += np.bincount(one, force, minlength=n) + np.bincount(other, force, minlength=n)
+        return found
 
     def _trial_slips(self, state: State) -> np.ndarray:
         f, start = self.friction, self.start

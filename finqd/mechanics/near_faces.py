@@ -1,0 +1,141 @@
+"""Which faces of soft bodies may come to touch: a broad phase that costs next to nothing while nothing is near."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from finqd.mechanics.contact_surface import ContactSurface
+from finqd.mechanics.proximity_kernels import CENTRE, deviation, farthest_move, near_pairs
+from finqd.scene import SoftBody
+
+MARGIN = 2.5  # gaps that faces may come closer before their list is made anew
+NOTCH = 2.0  # gaps that faces of one body are apart at rest, at least, for them to touch each other
+#: triangles of a face by its number of vertices, between its local points (see `finqd.mechanics.proximity_kernels`)
+PIECES = {
+    3: [(0, 1, 2)],
+    4: [(0, 1, CENTRE), (1, 2, CENTRE), (2, 3, CENTRE), (3, 0, CENTRE)],
+    6: [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)],
+    8: [(i, j, CENTRE) for i, j in ((0, 4), (4, 1), (1, 5), (5, 2), (2, 6), (6, 3), (3, 7), (7, 0))],
+}
+
+
+def face_pieces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles of all ``faces`` (n_faces, k): those of face f are first[f] to first[f + 1] (n_faces + 1,)
+    of corners (n, 3), local points.
+    """
+    cut = [PIECES[int(n)] for n in np.sum(faces >= 0, axis=1)]
+    first = np.concatenate([[0], np.cumsum([len(pieces) for pieces in cut])]).astype(np.int64)
+    corners = np.array([corners for pieces in cut for corners in pieces], dtype=np.int64).reshape(-1, 3)
+    return first, corners
+
+
+@dataclass
+class _Watch:
+    """Pairs of faces of one body, or of two, that were near at ``reference`` (n_vertices, 3)."""
+
+    bodies: tuple[int, int]
+    faces: np.ndarray
+    side: np.ndarray
+    reference: np.ndarray | None = None
+    listed: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+
+
+class NearFaces:
+    """Pairs of faces that may be nearer to each other than ``gap`` [m], of one body or of two.
+
+    Lists are made by boxes and separating axes, with a margin, and made anew when a body has deviated from a rigid
+    motion by half of it (faces of one body), or two bodies have moved by it in sum. Two bodies whose boxes are apart
+    have none. Which pairs are listed beyond those nearer than the gap depends on the way there; that must not matter.
+
+    Faces of one body that share a vertex, or are nearer at rest than `NOTCH` gaps (beside a notch, or on both sides of
+    the thinnest wall), never touch each other.
+    """
+
+    def __init__(self, bodies: Sequence[SoftBody], surface: ContactSurface, *, gap: float) -> None:
+        self.gap, self.margin = gap, MARGIN * gap
+        self.faces = surface.faces
+        self.spans = [(body.first_vertex, body.first_vertex + body.mesh.n_vertices) for body in bodies]
+        mine = [np.flatnonzero(surface.face_body == i) for i in range(len(bodies))]
+        self.watches = []
+        for i in range(len(bodies)):
+            for j in range(i, len(bodies)):
+                one, other = mine[i], mine[j] if j > i else mine[i][:0]
+                ids, side = np.concatenate([one, other]), np.repeat([0, 1], [len(one), len(other)])
+                self.watches.append(_Watch((i, j), ids, side))
+        self._apart = np.zeros(0, dtype=np.int64)
+        rest = np.concatenate([body.mesh.vertices for body in bodies])
+        notches = [self.pairs(rest, watch, NOTCH * gap) for watch in self.watches if watch.bodies[0] == watch.bodies[1]]
+        self._apart = np.sort(np.concatenate([pairs @ self._radix for pairs in notches]))
+
+    @property
+    def _radix(self) -> np.ndarray:
+        return np.array([len(self.faces), 1], dtype=np.int64)
+
+    def pairs(
+        self, positions: np.ndarray, watch: _Watch, reach: float, direction: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the pairs of a watch's faces that may be nearer than ``reach`` [m], (n, 2), ascending.
+
+        With a ``direction`` (n_vertices, 3) [m]: anywhere on the way along it.
+        """
+        found, moving = np.zeros((256, 2), dtype=np.int64), direction is not None
+        moves = positions if direction is None else direction
+        while True:
+            count = near_pairs(
+                positions, moves, moving, self.faces, watch.faces, watch.side, reach, self._apart, found
+            )
+            if count <= len(found):
+                found = found[:count]
+                return found[np.argsort(found @ self._radix)]
+            found = np.zeros((2 * count, 2), dtype=np.int64)
+
+    def at(self, positions: np.ndarray) -> np.ndarray:
+        """Return pairs (n, 2), lower id first, ascending, with all that are nearer than the gap at ``positions``."""
+        boxes = self._boxes(positions)
+        return self._joined([self._list(positions, watch) for watch in self.watches if self._meet(boxes, watch)])
+
+    def on_the_way(self, positions: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return pairs (n, 2), as `at` does, with all that may meet on the way to ``positions + direction``."""
+        end, listed = positions + direction, []
+        boxes = [
+            (np.minimum(a, c), np.maximum(b, d))
+            for (a, b), (c, d) in zip(self._boxes(positions), self._boxes(end), strict=True)
+        ]
+        for watch in self.watches:
+            if self._meet(boxes, watch):
+                pairs = self._list(positions, watch)
+                far = self._moved(end, watch) > self.margin
+                listed.append(self.pairs(positions, watch, self.gap, direction) if far else pairs)
+        return self._joined(listed)
+
+    def _boxes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [(positions[a:b].min(axis=0), positions[a:b].max(axis=0)) for a, b in self.spans]
+
+    def _meet(self, boxes: list[tuple[np.ndarray, np.ndarray]], watch: _Watch) -> bool:
+        """Tell whether the bodies' boxes are nearer than the gap."""
+        (low, high), (other_low, other_high) = (boxes[b] for b in watch.bodies)
+        return not np.any((low > other_high + self.gap) | (other_low > high + self.gap))
+
+    def _list(self, positions: np.ndarray, watch: _Watch) -> np.ndarray:
+        """Return the pairs of a watch, renewed where they might lack one at ``positions``."""
+        if watch.reference is None or not self._moved(positions, watch) <= self.margin:
+            watch.reference = positions
+            watch.listed = self.pairs(positions, watch, self.gap + self.margin)
+        return watch.listed
+
+    def _joined(self, listed: list[np.ndarray]) -> np.ndarray:
+        listed = [pairs for pairs in listed if len(pairs)]
+        if len(listed) < 2:
+            return listed[0] if listed else np.zeros((0, 2), dtype=np.int64)
+        found = np.concatenate(listed)
+        return found[np.argsort(found @ self._radix)]
+
+    def _moved(self, positions: np.ndarray, watch: _Watch) -> float:
+        """Return how much nearer faces of a watch may have come since its list was made [m]."""
+        i, j = watch.bodies
+        if i == j:
+            return 2.0 * float(deviation(positions, watch.reference, *self.spans[i]))
+        return sum(float(farthest_move(positions, watch.reference, *self.spans[b])) for b in (i, j))

@@ -1,0 +1,311 @@
+"""Kernels of what is near what: closest points, which faces may touch, and how far bodies deviate from rigid motion.
+
+A face is a row of vertex ids, -1 pads. It lies within the convex hull of its vertices, since its points are weighted
+by shares. ``pieces`` cut it into triangles between *local points*: its vertices, and `CENTRE`, the mean of the last
+four of them, in the middle of a quadrilateral.
+"""
+
+import math
+
+import numpy as np
+
+from finqd.mechanics.compiled import njit
+from finqd.mechanics.contact_kernels import face_box
+from finqd.mechanics.polar_kernels import closest_rotation
+
+CENTRE = 8  # local number of a quadrilateral's middle
+LOCALS = 9  # local points of a face at most
+
+
+@njit(cache=True)
+def closest_on_triangle(p, a, b, c, share):
+    """Write the barycentric ``share`` (3,) of the point of the triangle abc that is closest to p; exact zeros on rims.
+
+    Source: Ericson, Real-Time Collision Detection, 2005, 5.1.5.
+    """
+    ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    d1 = ab0 * (p[0] - a[0]) + ab1 * (p[1] - a[1]) + ab2 * (p[2] - a[2])
+    d2 = ac0 * (p[0] - a[0]) + ac1 * (p[1] - a[1]) + ac2 * (p[2] - a[2])
+    share[0], share[1], share[2] = 1.0, 0.0, 0.0
+    if d1 <= 0.0 and d2 <= 0.0:
+        return
+    d3 = ab0 * (p[0] - b[0]) + ab1 * (p[1] - b[1]) + ab2 * (p[2] - b[2])
+    d4 = ac0 * (p[0] - b[0]) + ac1 * (p[1] - b[1]) + ac2 * (p[2] - b[2])
+    if d3 >= 0.0 and d4 <= d3:
+        share[0], share[1] = 0.0, 1.0
+        return
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0 and d1 - d3 > 0.0:
+        share[1] = d1 / (d1 - d3)
+        share[0] = 1.0 - share[1]
+        return
+    d5 = ab0 * (p[0] - c[0]) + ab1 * (p[1] - c[1]) + ab2 * (p[2] - c[2])
+    d6 = ac0 * (p[0] - c[0]) + ac1 * (p[1] - c[1]) + ac2 * (p[2] - c[2])
+    if d6 >= 0.0 and d5 <= d6:
+        share[0], share[2] = 0.0, 1.0
+        return
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0 and d2 - d6 > 0.0:
+        share[2] = d2 / (d2 - d6)
+        share[0] = 1.0 - share[2]
+        return
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0 and (d4 - d3) + (d5 - d6) > 0.0:
+        share[2] = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        share[0], share[1] = 0.0, 1.0 - share[2]
+        return
+    whole = va + vb + vc
+    if whole > 0.0:
+        share[1], share[2] = vb / whole, vc / whole
+        share[0] = 1.0 - share[1] - share[2]
+
+
+@njit(cache=True)
+def local_points(values, nodes, found):
+    """Write ``values`` (n_vertices, 3) at the local points of a face to ``found`` (LOCALS, 3)."""
+    n = 0
+    while n < nodes.shape[0] and nodes[n] >= 0:
+        for i in range(3):
+            found[n, i] = values[nodes[n], i]
+        n += 1
+    if n == 4 or n == 8:
+        for i in range(3):
+            found[CENTRE, i] = 0.25 * (found[n - 4, i] + found[n - 3, i] + found[n - 2, i] + found[n - 1, i])
+
+
+@njit(cache=True)
+def local_weights(nodes, corners, share, weight):
+    """Write the weights (k,) of a face's vertices at ``share`` (3,) of its piece between local ``corners`` (3,)."""
+    n = 0
+    while n < nodes.shape[0] and nodes[n] >= 0:
+        n += 1
+    weight[:] = 0.0
+    for i in range(3):
+        if corners[i] == CENTRE:
+            for a in range(n - 4, n):
+                weight[a] += 0.25 * share[i]
+        else:
+            weight[corners[i]] += share[i]
+
+
+@njit(cache=True)
+def all_local_weights(faces, other, corners, piece, share, weights):
+    """Write the `local_weights` (n, k) of n rows with faces ``other`` (n,), ``piece`` (n,) and ``share`` (n, 3)."""
+    for c in range(other.shape[0]):
+        local_weights(faces[other[c]], corners[piece[c]], share[c], weights[c])
+
+
+@njit(cache=True)
+def closest_on_face(p, points, corners, first, end, limit2, best):
+    """Return (squared distance, piece) of the closest point of a face; piece -1 if none is nearer than the limit.
+
+    points: local ones of the face; corners (n, 3): of all pieces, of which the face has first to end; limit2: squared
+    distance that is too far [m^2]; best (3,): the share there, written if a piece is found
+    """
+    share, found = np.empty(3), -1
+    for piece in range(first, end):
+        a, b, c = points[corners[piece, 0]], points[corners[piece, 1]], points[corners[piece, 2]]
+        closest_on_triangle(p, a, b, c, share)
+        d2 = 0.0
+        for i in range(3):
+            d2 += (p[i] - share[0] * a[i] - share[1] * b[i] - share[2] * c[i]) ** 2
+        if d2 < limit2:
+            limit2, found = d2, piece
+            for i in range(3):
+                best[i] = share[i]
+    return limit2, found
+
+
+@njit(cache=True)
+def faces_gap(positions, a, b, enough):
+    """Return a lower bound of the distance [m] of two faces, by what separates them along some axes.
+
+    ``enough``: a bound that is as good as any larger one; the axes are those of the world, both normals and the line
+    between the middles.
+    """
+    axes = np.zeros((3, 3))
+    best = -np.inf
+    for i in range(3):
+        low_a, high_a, low_b, high_b, mid_a, mid_b = np.inf, -np.inf, np.inf, -np.inf, 0.0, 0.0
+        n_a, n_b = 0, 0
+        for k in range(a.shape[0]):
+            if a[k] >= 0:
+                x = positions[a[k], i]
+                low_a, high_a, mid_a, n_a = min(low_a, x), max(high_a, x), mid_a + x, n_a + 1
+            if b[k] >= 0:
+                x = positions[b[k], i]
+                low_b, high_b, mid_b, n_b = min(low_b, x), max(high_b, x), mid_b + x, n_b + 1
+        best = max(best, low_b - high_a, low_a - high_b)
+        axes[2, i] = mid_b / n_b - mid_a / n_a
+    if best >= enough:
+        return best
+    _normal(positions, a, axes[0])
+    _normal(positions, b, axes[1])
+    for axis in axes:
+        length = math.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+        if length == 0.0:
+            continue
+        low_a, high_a, low_b, high_b = np.inf, -np.inf, np.inf, -np.inf
+        for k in range(a.shape[0]):
+            if a[k] >= 0:
+                x = _along(positions, a[k], axis)
+                low_a, high_a = min(low_a, x), max(high_a, x)
+            if b[k] >= 0:
+                x = _along(positions, b[k], axis)
+                low_b, high_b = min(low_b, x), max(high_b, x)
+        best = max(best, (low_b - high_a) / length, (low_a - high_b) / length)
+        if best >= enough:
+            return best
+    return best
+
+
+@njit(cache=True)
+def _along(positions, vertex, axis):
+    return positions[vertex, 0] * axis[0] + positions[vertex, 1] * axis[1] + positions[vertex, 2] * axis[2]
+
+
+@njit(cache=True)
+def _normal(positions, nodes, normal):
+    """Write a normal of a face, of any length: the cross product of its diagonals, or of two sides of a triangle."""
+    n = 0
+    while n < nodes.shape[0] and nodes[n] >= 0:
+        n += 1
+    quad = n == 4 or n == 8
+    i, j = (nodes[0], nodes[2]) if quad else (nodes[0], nodes[1])
+    k, m = (nodes[1], nodes[3]) if quad else (nodes[0], nodes[2])
+    u, v = positions[j] - positions[i], positions[m] - positions[k]
+    normal[0], normal[1], normal[2] = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@njit(cache=True)
+def relative_way(direction, a, b):
+    """Return a bound of how far any point of one face moves relative to any of the other [m]."""
+    middle, n = np.zeros(3), 0
+    for k in range(a.shape[0]):
+        for v in (a[k], b[k]):
+            if v >= 0:
+                middle += direction[v]
+                n += 1
+    middle /= n
+    ways = np.zeros(2)
+    for k in range(a.shape[0]):
+        for side in range(2):
+            v = a[k] if side == 0 else b[k]
+            if v >= 0:
+                off = direction[v] - middle
+                ways[side] = max(ways[side], math.sqrt(off[0] ** 2 + off[1] ** 2 + off[2] ** 2))
+    return ways[0] + ways[1]
+
+
+@njit(cache=True)
+def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out):
+    """Write the pairs (lower id, higher id) of faces that may be nearer than ``reach`` [m]; return how many there are.
+
+    moving: whether all the way along ``direction`` counts, instead of ``positions`` alone, both (n_vertices, 3) [m]
+
+    ids (n,): of the faces looked at; side (n,): only pairs of different sides count, or all if every side is 0
+    apart: keys (lower id times n_faces plus higher id, ascending) of pairs that never count; pairs that share a vertex
+    do not either. out (m, 2): pairs beyond its end are counted, not written. Sweep along x: Ericson 2005, 7.5.
+    """
+    n = ids.shape[0]
+    low, high = np.empty((n, 3)), np.empty((n, 3))
+    mixed = False
+    for i in range(n):
+        face_box(positions, faces[ids[i]], low[i], high[i])
+        if moving:
+            _sweep_box(direction, positions, faces[ids[i]], low[i], high[i])
+        mixed = mixed or side[i] != 0
+    order, count = np.argsort(low[:, 0]), 0
+    for k in range(n):
+        i = order[k]
+        for m in range(k + 1, n):
+            j = order[m]
+            if low[j, 0] > high[i, 0] + reach:
+                break
+            if mixed and side[i] == side[j]:
+                continue
+            if low[j, 1] > high[i, 1] + reach or low[i, 1] > high[j, 1] + reach:
+                continue
+            if low[j, 2] > high[i, 2] + reach or low[i, 2] > high[j, 2] + reach:
+                continue
+            a, b = min(ids[i], ids[j]), max(ids[i], ids[j])
+            if not mixed and _share_vertex(faces[a], faces[b]):
+                continue
+            least = reach + (relative_way(direction, faces[a], faces[b]) if moving else 0.0)
+            if faces_gap(positions, faces[a], faces[b], least) >= least:
+                continue
+            if apart.shape[0] > 0:
+                key = a * faces.shape[0] + b
+                at = np.searchsorted(apart, key)
+                if at < apart.shape[0] and apart[at] == key:
+                    continue
+            if count < out.shape[0]:
+                out[count, 0], out[count, 1] = a, b
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _sweep_box(direction, positions, nodes, low, high):
+    """Widen the box of a face by where it moves to."""
+    for n in nodes:
+        if n >= 0:
+            for i in range(3):
+                x = positions[n, i] + direction[n, i]
+                low[i], high[i] = min(low[i], x), max(high[i], x)
+
+
+@njit(cache=True)
+def _share_vertex(a, b):
+    for i in a:
+        if i >= 0:
+            for j in b:
+                if i == j:
+                    return True
+    return False
+
+
+@njit(cache=True)
+def deviation(positions, reference, first, end):
+    """Return how far any vertex from ``first`` to ``end`` is from where a rigid motion of ``reference`` puts it [m].
+
+    The motion is the best one in the mean square (Kabsch, Acta Cryst. A32 (1976) 922).
+    """
+    n = end - first
+    here, there = np.zeros(3), np.zeros(3)
+    for v in range(first, end):
+        for i in range(3):
+            here[i] += positions[v, i] / n
+            there[i] += reference[v, i] / n
+    spread = np.zeros((3, 3))
+    for v in range(first, end):
+        for i in range(3):
+            for j in range(3):
+                spread[i, j] += (positions[v, i] - here[i]) * (reference[v, j] - there[j])
+    turn = np.empty((3, 3))
+    closest_rotation(spread, turn)
+    largest = 0.0
+    for v in range(first, end):
+        off2 = 0.0
+        for i in range(3):
+            off = positions[v, i] - here[i]
+            for j in range(3):
+                off -= turn[i, j] * (reference[v, j] - there[j])
+            off2 += off * off
+        if not off2 <= largest:  # takes a NaN too
+            largest = off2
+    return math.sqrt(largest)
+
+
+@njit(cache=True)
+def farthest_move(positions, reference, first, end):
+    """Return how far any vertex from ``first`` to ``end`` has moved [m]."""
+    largest = 0.0
+    for v in range(first, end):
+        off2 = 0.0
+        for i in range(3):
+            off2 += (positions[v, i] - reference[v, i]) ** 2
+        if not off2 <= largest:
+            largest = off2
+    return math.sqrt(largest)
