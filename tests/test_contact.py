@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from finqd.mechanics.contact_rows import KeyedValues
+from finqd.mechanics.contact_rows import FrictionBounds
 from finqd.mechanics.distance_kernels import signed_distance
 from finqd.mechanics.material import Material
 from finqd.mechanics.rotation_kernels import rotation_matrix
@@ -228,18 +228,18 @@ def test_friction_never_leaves_coulombs_cone() -> None:
 
 def test_renewing_friction_bounds_comes_to_rest_where_full_renewals_swing() -> None:
     """A wedge in which friction carries as much as it takes from the normal force: bounds = c - A bounds."""
-    contact = make("ball on soft").contact
+    bounds = FrictionBounds()
     generator, size = np.random.default_rng(5), 200
     rate, target = generator.uniform(0.9, 1.1, size), generator.uniform(0.5, 1.0, size)
     fixed, keys = target / (1.0 + rate), np.arange(size)
 
     def renew(count: int) -> float:
-        contact._missing, contact.bounds = None, KeyedValues(keys=keys, values=np.zeros(size))
+        bounds.begin()
+        bounds.renew(keys, np.zeros(size), whole=True)
         for _ in range(count):
-            bounds = contact.bounds.at(keys)
-            contact.bounds = contact._relaxed(KeyedValues(keys=keys, values=target - rate * bounds - bounds))
-            assert contact.bounds.values.min() >= 0.0
-        return float(np.max(np.abs(contact.bounds.at(keys) - fixed)))
+            bounds.renew(keys, target - rate * bounds.values.at(keys), whole=False)
+            assert bounds.values.values.min() >= 0.0
+        return float(np.max(np.abs(bounds.values.at(keys) - fixed)))
 
     assert renew(1) > 0.4 and renew(6) < 0.01
     plain = np.zeros(size)

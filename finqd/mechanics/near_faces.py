@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from finqd.mechanics.contact_surface import ContactSurface
-from finqd.mechanics.proximity_kernels import CENTRE, deviation, farthest_move, near_pairs
+from finqd.mechanics.proximity_kernels import CENTRE, body_box, near_pairs, refine_gaps, relative_moves, remaining_gaps
 from finqd.scene import SoftBody
 
-MARGIN = 2.5  # gaps that faces may come closer before their list is made anew
+MARGIN = 20.0  # gaps that faces may come closer before their list is made anew
 NOTCH = 2.0  # gaps that faces of one body are apart at rest, at least, for them to touch each other
 #: triangles of a face by its number of vertices, between its local points (see `finqd.mechanics.proximity_kernels`)
 PIECES = {
@@ -34,13 +34,21 @@ def face_pieces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class _Watch:
-    """Pairs of faces of one body, or of two, that were near at ``reference`` (n_vertices, 3)."""
+    """Pairs of faces of one body, or of two, that were near at ``reference`` (n_vertices, 3).
+
+    gaps: lower bound of the distance that each of them had there [m], (n,); seen: positions that were asked for last,
+    how much nearer any faces may have come there since [m], and the lower bounds that remain (n,)
+    """
 
     bodies: tuple[int, int]
     faces: np.ndarray
     side: np.ndarray
     reference: np.ndarray | None = None
     listed: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    gaps: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    seen: np.ndarray | None = None
+    moved: float = 0.0
+    remaining: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 class NearFaces:
@@ -56,7 +64,7 @@ class NearFaces:
 
     def __init__(self, bodies: Sequence[SoftBody], surface: ContactSurface, *, gap: float) -> None:
         self.gap, self.margin = gap, MARGIN * gap
-        self.faces = surface.faces
+        self.surface, self.faces, self.pieces = surface, surface.faces, face_pieces(surface.faces)
         self.spans = [(body.first_vertex, body.first_vertex + body.mesh.n_vertices) for body in bodies]
         mine = [np.flatnonzero(surface.face_body == i) for i in range(len(bodies))]
         self.watches = []
@@ -67,7 +75,9 @@ class NearFaces:
                 self.watches.append(_Watch((i, j), ids, side))
         self._apart = np.zeros(0, dtype=np.int64)
         rest = np.concatenate([body.mesh.vertices for body in bodies])
-        notches = [self.pairs(rest, watch, NOTCH * gap) for watch in self.watches if watch.bodies[0] == watch.bodies[1]]
+        self._moves = np.zeros_like(rest)
+        alone = [watch for watch in self.watches if len(set(watch.bodies)) == 1]
+        notches = [self.pairs(rest, watch, NOTCH * gap)[0] for watch in alone]
         self._apart = np.sort(np.concatenate([pairs @ self._radix for pairs in notches]))
 
     @property
@@ -76,26 +86,34 @@ class NearFaces:
 
     def pairs(
         self, positions: np.ndarray, watch: _Watch, reach: float, direction: np.ndarray | None = None
-    ) -> np.ndarray:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs of a watch's faces that may be nearer than ``reach`` [m], (n, 2), ascending.
 
-        With a ``direction`` (n_vertices, 3) [m]: anywhere on the way along it.
+        And lower bounds (n,) of their distances [m]. With a ``direction`` (n_vertices, 3) [m]: anywhere on the way.
         """
-        found, moving = np.zeros((256, 2), dtype=np.int64), direction is not None
+        found, gaps, moving = np.zeros((256, 2), dtype=np.int64), np.zeros(256), direction is not None
         moves = positions if direction is None else direction
         while True:
             count = near_pairs(
-                positions, moves, moving, self.faces, watch.faces, watch.side, reach, self._apart, found
+                positions, moves, moving, self.faces, watch.faces, watch.side, reach, self._apart, found, gaps
             )
             if count <= len(found):
-                found = found[:count]
-                return found[np.argsort(found @ self._radix)]
-            found = np.zeros((2 * count, 2), dtype=np.int64)
+                order = np.argsort(found[:count] @ self._radix)
+                found, gaps = found[order], gaps[order]
+                if not moving:
+                    refine_gaps(positions, *self.surface.lattices, *self.pieces, found, gaps, NOTCH * self.gap)
+                near = gaps < reach
+                return found[near], gaps[near]
+            found, gaps = np.zeros((2 * count, 2), dtype=np.int64), np.zeros(2 * count)
 
     def at(self, positions: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), lower id first, ascending, with all that are nearer than the gap at ``positions``."""
-        boxes = self._boxes(positions)
-        return self._joined([self._list(positions, watch) for watch in self.watches if self._meet(boxes, watch)])
+        boxes, listed = self._boxes(positions), []
+        for watch in self.watches:
+            if self._meet(boxes, watch):
+                self._renew(positions, watch)
+                listed.append(watch.listed[self._remaining(positions, watch) <= self.gap])
+        return self._joined(listed)
 
     def on_the_way(self, positions: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), as `at` does, with all that may meet on the way to ``positions + direction``."""
@@ -105,26 +123,32 @@ class NearFaces:
             for (a, b), (c, d) in zip(self._boxes(positions), self._boxes(end), strict=True)
         ]
         for watch in self.watches:
-            if self._meet(boxes, watch):
-                pairs = self._list(positions, watch)
-                far = self._moved(end, watch) > self.margin
-                listed.append(self.pairs(positions, watch, self.gap, direction) if far else pairs)
+            if not self._meet(boxes, watch):
+                continue
+            self._renew(positions, watch)
+            now = self._remaining(positions, watch)
+            if self._moved(end, watch) <= self.margin:
+                listed.append(watch.listed[np.minimum(now, self._remaining(end, watch)) <= self.gap])
+            else:
+                listed.append(self.pairs(positions, watch, self.gap, direction)[0])
         return self._joined(listed)
 
     def _boxes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        return [(positions[a:b].min(axis=0), positions[a:b].max(axis=0)) for a, b in self.spans]
+        boxes = [(np.empty(3), np.empty(3)) for _ in self.spans]
+        for span, box in zip(self.spans, boxes, strict=True):
+            body_box(positions, *span, *box)
+        return boxes
 
     def _meet(self, boxes: list[tuple[np.ndarray, np.ndarray]], watch: _Watch) -> bool:
         """Tell whether the bodies' boxes are nearer than the gap."""
         (low, high), (other_low, other_high) = (boxes[b] for b in watch.bodies)
         return not np.any((low > other_high + self.gap) | (other_low > high + self.gap))
 
-    def _list(self, positions: np.ndarray, watch: _Watch) -> np.ndarray:
-        """Return the pairs of a watch, renewed where they might lack one at ``positions``."""
+    def _renew(self, positions: np.ndarray, watch: _Watch) -> None:
+        """Make the list of a watch anew where it might lack a pair at ``positions``."""
         if watch.reference is None or not self._moved(positions, watch) <= self.margin:
-            watch.reference = positions
-            watch.listed = self.pairs(positions, watch, self.gap + self.margin)
-        return watch.listed
+            watch.reference, watch.seen = positions, None
+            watch.listed, watch.gaps = self.pairs(positions, watch, self.gap + self.margin)
 
     def _joined(self, listed: list[np.ndarray]) -> np.ndarray:
         listed = [pairs for pairs in listed if len(pairs)]
@@ -135,7 +159,16 @@ class NearFaces:
 
     def _moved(self, positions: np.ndarray, watch: _Watch) -> float:
         """Return how much nearer faces of a watch may have come since its list was made [m]."""
-        i, j = watch.bodies
-        if i == j:
-            return 2.0 * float(deviation(positions, watch.reference, *self.spans[i]))
-        return sum(float(farthest_move(positions, watch.reference, *self.spans[b])) for b in (i, j))
+        if watch.seen is not positions:
+            watch.seen = positions
+            bodies = sorted(set(watch.bodies))
+            alone = len(bodies) == 1
+            ways = [relative_moves(positions, watch.reference, *self.spans[b], alone, self._moves) for b in bodies]
+            watch.moved, watch.remaining = (1 + alone) * float(sum(ways)), np.empty(len(watch.listed))
+            remaining_gaps(self._moves, self.faces, watch.faces, watch.listed, watch.gaps, watch.remaining)
+        return watch.moved
+
+    def _remaining(self, positions: np.ndarray, watch: _Watch) -> np.ndarray:
+        """Return a lower bound of the distance of each pair of faces on a watch's list at ``positions`` [m]."""
+        self._moved(positions, watch)
+        return watch.remaining

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from finqd.mechanics.compiled import njit
-from finqd.mechanics.contact_kernels import face_box
+from finqd.mechanics.contact_kernels import face_box, face_point
 from finqd.mechanics.polar_kernels import closest_rotation
 
 CENTRE = 8  # local number of a quadrilateral's middle
@@ -181,32 +181,38 @@ def _normal(positions, nodes, normal):
 @njit(cache=True)
 def relative_way(direction, a, b):
     """Return a bound of how far any point of one face moves relative to any of the other [m]."""
-    middle, n = np.zeros(3), 0
-    for k in range(a.shape[0]):
-        for v in (a[k], b[k]):
-            if v >= 0:
-                middle += direction[v]
-                n += 1
-    middle /= n
-    ways = np.zeros(2)
-    for k in range(a.shape[0]):
-        for side in range(2):
-            v = a[k] if side == 0 else b[k]
-            if v >= 0:
-                off = direction[v] - middle
-                ways[side] = max(ways[side], math.sqrt(off[0] ** 2 + off[1] ** 2 + off[2] ** 2))
-    return ways[0] + ways[1]
+    a0, a1, a2, spread_a = _mean_move(direction, a)
+    b0, b1, b2, spread_b = _mean_move(direction, b)
+    return math.sqrt((a0 - b0) ** 2 + (a1 - b1) ** 2 + (a2 - b2) ** 2) + spread_a + spread_b
 
 
 @njit(cache=True)
-def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out):
+def _mean_move(direction, nodes):
+    """Return the mean move of a face's vertices (three numbers), and how far that of any is from it [m]."""
+    x = y = z = 0.0
+    n = 0
+    while n < nodes.shape[0] and nodes[n] >= 0:
+        x, y, z = x + direction[nodes[n], 0], y + direction[nodes[n], 1], z + direction[nodes[n], 2]
+        n += 1
+    x, y, z, spread2 = x / n, y / n, z / n, 0.0
+    for k in range(n):
+        v = nodes[k]
+        off2 = (direction[v, 0] - x) ** 2 + (direction[v, 1] - y) ** 2 + (direction[v, 2] - z) ** 2
+        if not off2 <= spread2:  # takes a NaN too
+            spread2 = off2
+    return x, y, z, math.sqrt(spread2)
+
+
+@njit(cache=True)
+def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out, out_gap):
     """Write the pairs (lower id, higher id) of faces that may be nearer than ``reach`` [m]; return how many there are.
 
     moving: whether all the way along ``direction`` counts, instead of ``positions`` alone, both (n_vertices, 3) [m]
 
     ids (n,): of the faces looked at; side (n,): only pairs of different sides count, or all if every side is 0
     apart: keys (lower id times n_faces plus higher id, ascending) of pairs that never count; pairs that share a vertex
-    do not either. out (m, 2): pairs beyond its end are counted, not written. Sweep along x: Ericson 2005, 7.5.
+    do not either. out (m, 2), out_gap (m,): lower bound of their distance now; pairs beyond the end are counted, not
+    written. Sweep along x: Ericson 2005, 7.5.
     """
     n = ids.shape[0]
     low, high = np.empty((n, 3)), np.empty((n, 3))
@@ -233,7 +239,8 @@ def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out
             if not mixed and _share_vertex(faces[a], faces[b]):
                 continue
             least = reach + (relative_way(direction, faces[a], faces[b]) if moving else 0.0)
-            if faces_gap(positions, faces[a], faces[b], least) >= least:
+            gap = faces_gap(positions, faces[a], faces[b], least)
+            if gap >= least:
                 continue
             if apart.shape[0] > 0:
                 key = a * faces.shape[0] + b
@@ -241,7 +248,7 @@ def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out
                 if at < apart.shape[0] and apart[at] == key:
                     continue
             if count < out.shape[0]:
-                out[count, 0], out[count, 1] = a, b
+                out[count, 0], out[count, 1], out_gap[count] = a, b, gap
             count += 1
     return count
 
@@ -257,6 +264,43 @@ def _sweep_box(direction, positions, nodes, low, high):
 
 
 @njit(cache=True)
+def refine_gaps(
+    positions, faces, face_lattice, lattice_first, lattice_weight, pieces, corners, listed, gaps, close
+):
+    """Replace ``gaps`` (n,) below ``close`` [m] by the distance of the samples of either face of a pair to the other.
+
+    Or by ``close``, if that is less: what separating axes say of faces that are bent, or stand at an angle, is too
+    little.
+    """
+    local, x, share, low, high = np.empty((LOCALS, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for p in range(listed.shape[0]):
+        if gaps[p] >= close:
+            continue
+        nearest2 = close * close
+        for side in range(2):
+            f, other = listed[p, side], listed[p, 1 - side]
+            local_points(positions, faces[other], local)
+            face_box(positions, faces[other], low, high)
+            for s in range(lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1]):
+                face_point(positions, faces[f], lattice_weight[s], x)
+                if box_distance2(x, low, high) < nearest2:
+                    nearest2, _ = closest_on_face(
+                        x, local, corners, pieces[other], pieces[other + 1], nearest2, share
+                    )
+        gaps[p] = math.sqrt(nearest2)
+
+
+@njit(cache=True)
+def box_distance2(x, low, high):
+    """Return the squared distance of a point from a box [m^2]."""
+    d2 = 0.0
+    for i in range(3):
+        off = max(low[i] - x[i], x[i] - high[i], 0.0)
+        d2 += off * off
+    return d2
+
+
+@njit(cache=True)
 def _share_vertex(a, b):
     for i in a:
         if i >= 0:
@@ -267,45 +311,59 @@ def _share_vertex(a, b):
 
 
 @njit(cache=True)
-def deviation(positions, reference, first, end):
-    """Return how far any vertex from ``first`` to ``end`` is from where a rigid motion of ``reference`` puts it [m].
+def body_box(positions, first, end, low, high):
+    """Write the box of the vertices from ``first`` to ``end`` [m]."""
+    for i in range(3):
+        low[i], high[i] = np.inf, -np.inf
+    for v in range(first, end):
+        for i in range(3):
+            low[i], high[i] = min(low[i], positions[v, i]), max(high[i], positions[v, i])
 
-    The motion is the best one in the mean square (Kabsch, Acta Cryst. A32 (1976) 922).
+
+@njit(cache=True)
+def relative_moves(positions, reference, first, end, rigid, moves):
+    """Write how vertices from ``first`` to ``end`` have moved from ``reference``; return the longest way, all in m.
+
+    rigid: after the best rigid motion in the mean square has been taken away, in the frame of the reference (Kabsch,
+    Acta Cryst. A32 (1976) 922)
     """
     n = end - first
-    here, there = np.zeros(3), np.zeros(3)
-    for v in range(first, end):
-        for i in range(3):
-            here[i] += positions[v, i] / n
-            there[i] += reference[v, i] / n
-    spread = np.zeros((3, 3))
-    for v in range(first, end):
-        for i in range(3):
-            for j in range(3):
-                spread[i, j] += (positions[v, i] - here[i]) * (reference[v, j] - there[j])
-    turn = np.empty((3, 3))
-    closest_rotation(spread, turn)
+    here, there, turn = np.zeros(3), np.zeros(3), np.eye(3)
+    if rigid:
+        for v in range(first, end):
+            for i in range(3):
+                here[i] += positions[v, i] / n
+                there[i] += reference[v, i] / n
+        spread = np.zeros((3, 3))
+        for v in range(first, end):
+            for i in range(3):
+                for j in range(3):
+                    spread[i, j] += (positions[v, i] - here[i]) * (reference[v, j] - there[j])
+        closest_rotation(spread, turn)
     largest = 0.0
     for v in range(first, end):
-        off2 = 0.0
+        x, y, z = positions[v, 0] - here[0], positions[v, 1] - here[1], positions[v, 2] - here[2]
+        way2 = 0.0
         for i in range(3):
-            off = positions[v, i] - here[i]
-            for j in range(3):
-                off -= turn[i, j] * (reference[v, j] - there[j])
-            off2 += off * off
-        if not off2 <= largest:  # takes a NaN too
-            largest = off2
+            moves[v, i] = turn[0, i] * x + turn[1, i] * y + turn[2, i] * z - (reference[v, i] - there[i])
+            way2 += moves[v, i] ** 2
+        if not way2 <= largest:  # takes a NaN too
+            largest = way2
     return math.sqrt(largest)
 
 
 @njit(cache=True)
-def farthest_move(positions, reference, first, end):
-    """Return how far any vertex from ``first`` to ``end`` has moved [m]."""
-    largest = 0.0
-    for v in range(first, end):
-        off2 = 0.0
+def remaining_gaps(moves, faces, ids, listed, gaps, out):
+    """Write a lower bound of the distance of each pair ``listed`` (n, 2); ``gaps`` (n,): one before ``moves``.
+
+    ids: of all faces that are listed, or more; the bound is that of `relative_way`.
+    """
+    mean, spread = np.empty((faces.shape[0], 3)), np.empty(faces.shape[0])
+    for f in ids:
+        mean[f, 0], mean[f, 1], mean[f, 2], spread[f] = _mean_move(moves, faces[f])
+    for p in range(listed.shape[0]):
+        a, b = listed[p, 0], listed[p, 1]
+        way2 = 0.0
         for i in range(3):
-            off2 += (positions[v, i] - reference[v, i]) ** 2
-        if not off2 <= largest:
-            largest = off2
-    return math.sqrt(largest)
+            way2 += (mean[a, i] - mean[b, i]) ** 2
+        out[p] = gaps[p] - math.sqrt(way2) - spread[a] - spread[b]

@@ -10,7 +10,7 @@ from finqd.mechanics import soft_contact_kernels as kernels
 from finqd.mechanics.contact_force_kernels import friction_energy, return_mapping
 from finqd.mechanics.contact_rows import KeyedValues
 from finqd.mechanics.contact_surface import ContactSurface
-from finqd.mechanics.near_faces import NearFaces, face_pieces
+from finqd.mechanics.near_faces import NearFaces
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.proximity_kernels import all_local_weights
 from finqd.mechanics.state import Direction, State
@@ -85,7 +85,7 @@ class SoftContact:
         self.surface, self.gap, self.pressure, self.ratio = surface, gap, pressure, ratio
         bodies = scene.soft_bodies
         self.near = NearFaces(bodies, surface, gap=gap)
-        self.pieces, self.corners = face_pieces(surface.faces)
+        self.pieces, self.corners = self.near.pieces
         self.coefficients = np.array([[scene.friction_between(a.name, b.name) for b in bodies] for a in bodies])
         self.rows = _Rows.empty(64, surface.faces.shape[1])
         self.friction = self._friction(np.zeros(0, dtype=np.int64))
@@ -259,7 +259,7 @@ class SoftContact:
         """Return the pairs of faces that are near, of the bodies that have come to touch."""
         owner = self.surface.face_body
         bodies = {tuple(sorted(pair)) for pair in np.transpose(owner[np.array(np.divmod(new, len(owner)))]).tolist()}
-        return [self.near.pairs(positions, watch, AHEAD) for watch in self.near.watches if watch.bodies in bodies]
+        return [self.near.pairs(positions, watch, AHEAD)[0] for watch in self.near.watches if watch.bodies in bodies]
 
     def _vertices(self) -> np.ndarray:
         """Return all pairs of vertices of faces that are coupled, (n, 2)."""

@@ -17,6 +17,7 @@ from finqd.mechanics.compiled import njit
 from finqd.mechanics.contact_kernels import face_box, face_point
 from finqd.mechanics.proximity_kernels import (
     LOCALS,
+    box_distance2,
     closest_on_face,
     faces_gap,
     local_points,
@@ -79,7 +80,7 @@ def find_rows(
             local_points(positions, faces[other], local)
             face_box(positions, faces[other], low, high)
             for s in range(end - first):
-                if _box_distance2(points[s], low, high) >= nearest2[s]:
+                if box_distance2(points[s], low, high) >= nearest2[s]:
                     continue
                 d2, found = closest_on_face(
                     points[s], local, corners, pieces[other], pieces[other + 1], nearest2[s], share
@@ -104,15 +105,6 @@ def find_rows(
                     out_normal[count] /= size
             count += 1
     return count
-
-
-@njit(cache=True)
-def _box_distance2(x, low, high):
-    d2 = 0.0
-    for i in range(3):
-        off = max(low[i] - x[i], x[i] - high[i], 0.0)
-        d2 += off * off
-    return d2
 
 
 @njit(cache=True)
@@ -335,27 +327,24 @@ def pairs_step_limit(
     continuous collision detection: Li, Kaufman and Jiang, ACM Trans. Graph. 40 (2021) 170, algorithm 1.
     """
     local, moves, near = np.empty((LOCALS, 3)), np.empty((LOCALS, 3)), np.empty((LOCALS, 3))
-    x, u = np.empty(3), np.empty(3)
+    x, u, low, high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for p in range(pairs.shape[0]):
-        if _apart_on_the_way(positions, direction, faces[pairs[p, 0]], faces[pairs[p, 1]], limit):
+        way = limit * relative_way(direction, faces[pairs[p, 0]], faces[pairs[p, 1]])
+        if faces_gap(positions, faces[pairs[p, 0]], faces[pairs[p, 1]], way) > way:
             continue
         for side in range(2):
             f, other = pairs[p, side], pairs[p, 1 - side]
             local_points(positions, faces[other], local)
             local_points(direction, faces[other], moves)
+            face_box(positions, faces[other], low, high)
             lattice, first, end = face_lattice[f], pieces[other], pieces[other + 1]
             for s in range(lattice_first[lattice], lattice_first[lattice + 1]):
                 face_point(positions, faces[f], lattice_weight[s], x)
+                if box_distance2(x, low, high) > way * way:
+                    continue
                 face_point(direction, faces[f], lattice_weight[s], u)
                 limit = _sample_limit(x, u, local, moves, near, faces[other], corners, first, end, limit)
     return limit
-
-
-@njit(cache=True)
-def _apart_on_the_way(positions, direction, a, b, limit):
-    """Tell whether two faces cannot meet: the gap between them is more than the way of one relative to the other."""
-    way = relative_way(direction, a, b) * limit
-    return faces_gap(positions, a, b, way) > way
 
 
 @njit(cache=True)
@@ -371,7 +360,9 @@ def _sample_limit(x, u, local, moves, near, nodes, corners, first, end, limit):
         rate = max(rate, math.sqrt(_dot(off, off)))
     if rate == 0.0:
         return limit
-    d2, _ = closest_on_face(x, local, corners, first, end, np.inf, share)
+    d2, found = closest_on_face(x, local, corners, first, end, (limit * rate / (1.0 - CLOSEST)) ** 2, share)
+    if found < 0:
+        return limit
     distance = math.sqrt(d2)
     least, at = CLOSEST * distance, 0.0
     for _ in range(MARCH):
