@@ -9,7 +9,7 @@ from finqd.mechanics import contact_force_kernels as force_kernels
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal, hold, largest_force
 from finqd.mechanics.contact_rows import KeyedValues, Rows
-from finqd.mechanics.contact_surface import contact_shape, contact_surface, lattice
+from finqd.mechanics.contact_surface import closed_lattice, contact_shape, contact_surface, lattice
 from finqd.mechanics.distance_kernels import signed_distance
 from finqd.mechanics.elements import face_shape
 from finqd.mechanics.material import Material
@@ -121,7 +121,8 @@ def test_plane_step_limit_stops_at_the_allowance() -> None:
 @pytest.mark.parametrize("kind", ["quad4", "quad8", "tri3", "tri6"])
 @pytest.mark.parametrize("cells", [(1, 1), (3, 2), (4, 5)])
 def test_lattice_covers_a_face_evenly(kind: str, cells: tuple[int, int]) -> None:
-    points = lattice(kind, *cells)
+    points, shares = lattice(kind, *cells)
+    assert np.ptp(shares) == 0.0 and shares.sum() == pytest.approx(1.0)
     if kind.startswith("quad"):
         n, m = cells
         assert len(points) == n * m and np.all(np.abs(points) < 1.0)
@@ -131,6 +132,16 @@ def test_lattice_covers_a_face_evenly(kind: str, cells: tuple[int, int]) -> None
         assert len(points) == cells[0] ** 2 and points.min() > 0.0 and points.sum(axis=1).max() < 1.0
         centroid = (1 / 3, 1 / 3)
     assert np.allclose(points.mean(axis=0), centroid, atol=1e-14)  # linear pressures are integrated exactly
+
+
+@pytest.mark.parametrize("kind", ["quad4", "quad8", "tri3", "tri6"])
+@pytest.mark.parametrize("cells", [(1, 1), (3, 2), (4, 5)])
+def test_closed_lattice_has_the_rim_and_covers_a_face_evenly(kind: str, cells: tuple[int, int]) -> None:
+    points, shares = closed_lattice(kind, *cells)
+    corners = [(-1, -1), (1, -1), (1, 1), (-1, 1)] if kind.startswith("quad") else [(0, 0), (1, 0), (0, 1)]
+    assert all((np.abs(points - corner).max(axis=1) < 1e-14).any() for corner in corners)
+    assert shares.min() > 0.0 and shares.sum() == pytest.approx(1.0)
+    assert np.allclose(shares @ points, np.mean(corners, axis=0), atol=1e-14)
 
 
 def test_samples_stand_for_the_whole_surface_once() -> None:

@@ -46,7 +46,7 @@ def face_box(positions, nodes, low, high):
 
 @njit(cache=True)
 def find_soft_rigid(
-    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, first_sample, pressure,
+    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
     centre, rotation, field, radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm,
     out_stiffness, out_rigid, out_turns, count,
 ):
@@ -74,7 +74,7 @@ def find_soft_rigid(
             continue
         last[:] = x
         first, end = lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1]
-        stiffness = pressure * face_area[f] / (end - first)
+        stiffness = pressure * face_area[f]
         for s in range(first, end):
             face_point(positions, faces[f], lattice_weight[s], x)
             if d > 0.0 and (x[0] - last[0]) ** 2 + (x[1] - last[1]) ** 2 + (x[2] - last[2]) ** 2 < d * d:
@@ -92,7 +92,7 @@ def find_soft_rigid(
                 for i in range(3):
                     out_normal[count, i] = rotation[i, 0] * n0 + rotation[i, 1] * n1 + rotation[i, 2] * n2
                     out_arm[count, i] = x[i] - centre[i]
-                out_stiffness[count] = stiffness
+                out_stiffness[count] = stiffness * lattice_share[s]
                 out_rigid[count] = rigid
                 out_turns[count] = 1
             count += 1
@@ -110,7 +110,7 @@ def _into_body(x, centre, rotation, y):
 
 @njit(cache=True)
 def find_soft_plane(
-    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, first_sample, pressure,
+    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
     point, normal, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm, out_stiffness, out_rigid,
     out_turns, count,
 ):
@@ -124,7 +124,7 @@ def find_soft_plane(
         if lowest >= 0.0:
             continue
         first, end = lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1]
-        stiffness = pressure * face_area[f] / (end - first)
+        stiffness = pressure * face_area[f]
         for s in range(first, end):
             face_point(positions, faces[f], lattice_weight[s], x)
             d = 0.0
@@ -139,7 +139,7 @@ def find_soft_plane(
                 out_gap[count] = d
                 out_normal[count] = normal
                 out_arm[count] = 0.0
-                out_stiffness[count] = stiffness
+                out_stiffness[count] = stiffness * lattice_share[s]
                 out_rigid[count] = -1
                 out_turns[count] = 0
             count += 1

@@ -18,8 +18,9 @@ class ContactSurface:
     faces: vertex ids, -1 pads, shape (n_faces, k); face_body: soft body of each face, face_area: at rest [m^2], both of
         shape (n_faces,)
     face_lattice: which lattice of samples a face has, shape (n_faces,); lattice l has the rows lattice_first[l] to
-        lattice_first[l + 1] of lattice_weight (n, k), a sample's weights of the face's vertices. All samples of a face
-        stand for equal areas, which is exact where its own coordinates stretch evenly, not beside quarter nodes
+        lattice_first[l + 1] of lattice_weight (n, k), a sample's weights of the face's vertices, and of lattice_share
+        (n,), the part of the face's area that it stands for: exact where the face's own coordinates stretch evenly, not
+        beside quarter nodes
     first_sample: numbers of the samples of face f, first_sample[f] to first_sample[f + 1], shape (n_faces + 1,)
     """
 
@@ -29,6 +30,7 @@ class ContactSurface:
     face_lattice: np.ndarray
     lattice_first: np.ndarray
     lattice_weight: np.ndarray
+    lattice_share: np.ndarray
     first_sample: np.ndarray
 
     @property
@@ -40,7 +42,8 @@ class ContactSurface:
     def arrays(self) -> tuple[np.ndarray, ...]:
         """What kernels take, in their order."""
         return (
-            self.faces, self.face_area, self.face_lattice, self.lattice_first, self.lattice_weight, self.first_sample,
+            self.faces, self.face_area, self.face_lattice, self.lattice_first, self.lattice_weight, self.lattice_share,
+            self.first_sample,
         )
 
     @property
@@ -49,17 +52,37 @@ class ContactSurface:
         return self.faces, self.face_lattice, self.lattice_first, self.lattice_weight
 
 
-def lattice(face_type: str, n: int, m: int) -> np.ndarray:
-    """Return local points (p, 2) in the middles of n by m equal cells (n by n for a triangle).
+def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return local points (p, 2) in the middles of n by m equal cells (n by n for a triangle), and their equal shares.
 
     None lies on the face's rim: where a body stands on a face, the faces beside that one would push along.
     """
     if face_type.startswith("quad"):
         u, v = ((2.0 * np.arange(cells) + 1.0) / cells - 1.0 for cells in (n, m))
-        return np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+        return np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2), np.full(n * m, 1.0 / (n * m))
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
     turned = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
-    return np.array(upright + turned) / n
+    return np.array(upright + turned) / n, np.full(n * n, 1.0 / (n * n))
+
+
+def closed_lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of n by m equal cells (n by n for a triangle) as local points (p, 2), and their shares (p,).
+
+    Those on the rim share an edge with the faces beside, so that they stand for half as much, or less.
+    """
+    if face_type.startswith("quad"):
+        u, v = (np.linspace(-1.0, 1.0, cells + 1) for cells in (n, m))
+        along = [np.where(np.abs(w) == 1.0, 0.5, 1.0) / cells for w, cells in ((u, n), (v, m))]
+        points = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+        return points, np.outer(*along).ravel()
+    place = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(n + 1) for j in range(n + 1 - i))}
+    share = np.zeros(len(place))
+    for i, j in place:
+        upright, turned = [(i, j), (i + 1, j), (i, j + 1)], [(i + 1, j + 1), (i + 1, j), (i, j + 1)]
+        for cell in (upright, turned):
+            if all(corner in place for corner in cell):
+                share[[place[corner] for corner in cell]] += 1.0 / (3.0 * n * n)
+    return np.array(list(place)) / n, share
 
 
 def contact_shape(face_type: str, xi: np.ndarray) -> np.ndarray:
@@ -112,15 +135,16 @@ def _cells(points: np.ndarray, face_type: str, spacing: float) -> np.ndarray:
 
 
 def contact_surface(
-    bodies: Sequence[SoftBody], *, spacing: float, most_cells: int | None = None
+    bodies: Sequence[SoftBody], *, spacing: float, most_cells: int | None = None, rims: bool = False
 ) -> ContactSurface:
     """Return the surface of ``bodies`` with samples about ``spacing`` [m] apart, at most on faces that stretch evenly.
 
-    Faces that are held are left out. ``most_cells``: samples along an edge of a face are no more than that.
+    Faces that are held are left out. ``most_cells``: cells along an edge of a face are no more than that; ``rims``:
+    samples are the corners of cells, on edges and corners of the bodies too, instead of their middles.
     """
     width = max((f.shape[1] for body in bodies for f in body.mesh.faces.values() if len(f)), default=4)
     lattices: dict[tuple[str, int, int], int] = {}
-    weights = [np.zeros((0, width))]
+    weights, shares = [np.zeros((0, width))], [np.zeros(0)]
     faces, owner, area, which = [np.zeros((0, width), dtype=np.int64)], [], [], []
     for number, body in enumerate(bodies):
         for kind in sorted(body.mesh.faces):
@@ -128,21 +152,23 @@ def contact_surface(
             block = block[~body.fixed.all(axis=1)[block].all(axis=1)] if len(block) else block
             if not len(block):
                 continue
-            points = body.mesh.vertices[block]
+            corners = body.mesh.vertices[block]
             faces.append(_padded(block + body.first_vertex, width, -1))
             owner.append(np.full(len(block), number))
-            area.append(_areas(points, kind))
-            for n, m in np.minimum(_cells(points, kind, spacing), most_cells or np.iinfo(int).max):
+            area.append(_areas(corners, kind))
+            for n, m in np.minimum(_cells(corners, kind, spacing), most_cells or np.iinfo(int).max):
                 if (kind, n, m) not in lattices:
                     lattices[kind, n, m] = len(lattices)
-                    weights.append(_padded(contact_shape(kind, lattice(kind, int(n), int(m))), width, 0.0))
+                    points, share = (closed_lattice if rims else lattice)(kind, int(n), int(m))
+                    weights.append(_padded(contact_shape(kind, points), width, 0.0))
+                    shares.append(share)
                 which.append(lattices[kind, n, m])
     first = np.cumsum([len(rows) for rows in weights])
     face_lattice = np.array(which, dtype=np.int64)
     return ContactSurface(
         faces=np.concatenate(faces), face_body=np.concatenate([np.zeros(0, dtype=np.int64), *owner]),
         face_area=np.concatenate([np.zeros(0), *area]), face_lattice=face_lattice, lattice_first=first,
-        lattice_weight=np.concatenate(weights),
+        lattice_weight=np.concatenate(weights), lattice_share=np.concatenate(shares),
         first_sample=np.concatenate([[0], np.cumsum(np.diff(first)[face_lattice])]).astype(np.int64),
     )
 

@@ -100,8 +100,9 @@ class NearFaces:
             if count <= len(found):
                 order = np.argsort(found[:count] @ self._radix)
                 found, gaps = found[order], gaps[order]
-                if not moving:
-                    refine_gaps(positions, *self.surface.lattices, *self.pieces, found, gaps, NOTCH * self.gap)
+                if moving:
+                    return found, gaps
+                refine_gaps(positions, *self.surface.lattices, *self.pieces, found, gaps, NOTCH * self.gap)
                 near = gaps < reach
                 return found[near], gaps[near]
             found, gaps = np.zeros((2 * count, 2), dtype=np.int64), np.zeros(2 * count)

@@ -48,9 +48,9 @@ def barrier(distance, gap, stiffness):
 
 @njit(cache=True)
 def find_rows(
-    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, first_sample, pressure, pieces, corners,
-    groups, group_first, others, gap, out_key, out_face, out_weight, out_other, out_piece, out_share, out_distance,
-    out_normal, out_stiffness,
+    positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
+    pieces, corners, groups, group_first, others, gap, out_key, out_face, out_weight, out_other, out_piece, out_share,
+    out_distance, out_normal, out_stiffness,
 ):
     """Write the samples of faces ``groups`` that are nearer than ``gap`` to one of their ``others``; return how many.
 
@@ -97,7 +97,7 @@ def find_rows(
                 out_key[count] = first_sample[f] + s
                 out_face[count], out_weight[count] = f, lattice_weight[first + s]
                 out_other[count], out_piece[count], out_share[count] = who[s], piece[s], where[s]
-                out_stiffness[count] = pressure * face_area[f] / (end - first)
+                out_stiffness[count] = pressure * face_area[f] * lattice_share[first + s]
                 _difference(positions, faces, points[s], who[s], corners[piece[s]], where[s], local, out_normal[count])
                 size = math.sqrt(out_normal[count, 0] ** 2 + out_normal[count, 1] ** 2 + out_normal[count, 2] ** 2)
                 out_distance[count] = size
@@ -329,7 +329,7 @@ def pairs_step_limit(
     local, moves, near = np.empty((LOCALS, 3)), np.empty((LOCALS, 3)), np.empty((LOCALS, 3))
     x, u, low, high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for p in range(pairs.shape[0]):
-        way = limit * relative_way(direction, faces[pairs[p, 0]], faces[pairs[p, 1]])
+        way = limit * relative_way(direction, faces[pairs[p, 0]], faces[pairs[p, 1]]) / (1.0 - CLOSEST)
         if faces_gap(positions, faces[pairs[p, 0]], faces[pairs[p, 1]], way) > way:
             continue
         for side in range(2):

@@ -31,6 +31,7 @@ SUPPORT_ALLOWANCE = 2.0  # multiples of `weight_penetration_mm` that such a poin
 FITTING = 0.3  # [mm] spacing of samples that fits bodies of up to
 THICK = 60.0 * MM  # this thickness; for thicker ones it grows with them
 PLANE_CELLS = 8  # samples of that spacing along an edge of a face are no more than these if all there is are planes
+SOFT_CELLS = 32  # along an edge of a face that touches other soft faces, at most
 FACE_SHARE = 0.1  # of the size of soft faces that they keep apart from each other at most
 
 
@@ -113,8 +114,10 @@ class PenaltyContact:
         if not options.soft_contact or not len(areas):
             return None
         gap = min(options.soft_gap_mm * MM, FACE_SHARE * math.sqrt(float(np.median(areas))))
+        spacing = options.sample_spacing_mm * MM
+        surface = contact_surface(self.scene.soft_bodies, spacing=spacing, most_cells=SOFT_CELLS, rims=True)
         ratio = options.friction_stiffness_ratio
-        return SoftContact(self.scene, self.surface, gap=gap, pressure=self.stiffness, ratio=ratio)
+        return SoftContact(self.scene, surface, gap=gap, pressure=self.stiffness, ratio=ratio)
 
     def _lay_out_keys(self) -> None:
         """Number all possible contacts: ``first_key`` of each pair, and friction by `_coefficients`."""
