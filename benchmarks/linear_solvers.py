@@ -53,7 +53,7 @@ def grasp_systems(object_name: str, until: float) -> tuple[BlockPattern, list[Ne
     design = Design.from_json(designs_folder() / "benchmark.json")
     mesher, geometry = design.plugin("mesher"), design.plugin("geometry")
     meshes = tuple(mesher.mesh(geometry.build(design.finger_si(i))) for i in range(len(design.fingers)))
-    scene, _ = grasp_scene(GraspTask(design=design, meshes=meshes, grasped=load_object(object_name)))
+    scene = grasp_scene(GraspTask(design=design, meshes=meshes, grasped=load_object(object_name)))
     kept: list[Newton] = []
     patterns: list[BlockPattern] = []
 

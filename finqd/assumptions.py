@@ -20,9 +20,9 @@ EFFECTS = {
     "large_rotation": "on: corotated elements",
     "material_nonlinearity": "off: the corotated law is linear in the strain",
     "damping": "off: only what implicit Euler itself dissipates",
-    "self_contact": "off: not built yet, walls and ribs of one finger pass through each other",
-    "finger_to_finger_contact": "off: not built yet, fingers pass through each other",
-    "soft_object": "off: objects are rigid",
+    "self_contact": "on: walls and ribs of one finger touch each other (contact.soft_contact)",
+    "finger_to_finger_contact": "on: fingers touch each other (contact.soft_contact)",
+    "soft_object": "on for objects whose file makes them soft",
 }
 
 
@@ -76,7 +76,8 @@ ASSUMPTIONS = (
     "rib centres lie on the line from the base's middle to the apex; a positive tilt lifts a rib's back end",
     "slivers of a hole with less than 1e-4 mm^2 are filled",
     "features are the gripper's as built: the pads that an export adds are in none of them",
-    "objects are rigid; a rigid body's inertia is taken at the start of a step, so fast tumbling gains some energy",
+    "objects are rigid unless their file makes them soft",
+    "a rigid body's inertia is taken at the start of a step, so fast tumbling gains some energy",
     "where fingers touch, sharp edges of objects count as rounded (contact.edge_radius_mm; less, or not, on fine ones)",
     "the mount is rigid: each finger base is driven as a whole",
     "each finger's drive stalls by itself when the sum of the normal contact forces on that finger reaches its limit",

@@ -16,7 +16,7 @@ from finqd.accuracy_bands import accuracy
 from finqd.assumptions import ASSUMPTIONS, effects_of
 from finqd.contracts import FitnessResult
 from finqd.errors import FinqdError, InputError, MeshError
-from finqd.grasp import GraspTask, base_height, simulate_grasp
+from finqd.grasp import GraspTask, base_height, object_heights, simulate_grasp
 from finqd.meshing import mesh_solid
 from finqd.objects import GraspObject, load_object, object_names
 from finqd.presets import apply_preset
@@ -92,7 +92,7 @@ class Evaluation:
             "max_contact_force_N": _finite(np.max(forces, initial=0.0)) if simulated else None,
             "final_contact_force_N": [float(f) for f in forces[-1]] if simulated else None,
             "max_penetration_mm": _finite(np.max(penetrations, initial=0.0) / MM) if simulated else None,
-            "final_height_mm": _finite(trajectory.rigid_positions[-1, 0, 2] / MM) if simulated else None,
+            "final_height_mm": _finite(object_heights(trajectory)[-1] / MM) if simulated else None,
             "simulated_s": float(trajectory.times[-1]) if simulated else 0.0,
             "steps": trajectory.counters.get("steps", 0),
             "newton_iterations": trajectory.counters.get("newton_iterations", 0),
@@ -238,13 +238,12 @@ def _write_record(folder: Path, task: GraspTask, trajectory: Trajectory) -> None
     from finqd.grasp import grasp_scene
     from finqd.record import write_paraview
 
-    scene, _ = grasp_scene(task)
+    scene = grasp_scene(task)
     target = folder / task.grasped.name
     os.makedirs(target, exist_ok=True)
     trajectory.save(target / "trajectory.npz")
-    write_paraview(
-        target, trajectory, [body.mesh for body in scene.soft_bodies], [(task.grasped.vertices, task.grasped.triangles)]
-    )
+    surfaces = [(body.shape.vertices, body.shape.triangles) for body in scene.rigid_bodies]
+    write_paraview(target, trajectory, [body.mesh for body in scene.soft_bodies], surfaces)
 
 
 def _finite(value: float) -> float | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from finqd.placement import placement
-from finqd.scene import RigidBody, Scene, Shift, Timed
+from finqd.scene import Scene, Shift, Timed
 from finqd.simulate import simulate
 from finqd.trajectory import Trajectory
 from finqd.units import MS
@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from finqd.protocol import GraspProtocol
 
 FLOOR = "floor"
+#: what touches what in a grasp -> the protocol's coefficient for it, where that is given
+FRICTION = {
+    ("finger", "object"): "friction_finger_object", ("finger", "finger"): "friction_finger_finger",
+    ("finger", FLOOR): "friction_finger_floor", ("object", FLOOR): "friction_object_floor",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +61,8 @@ def base_height(meshes: Sequence[Mesh], protocol: GraspProtocol) -> float:
     return max(float(mesh.vertices[:, 1].max()) for mesh in meshes) + protocol.si("tip_clearance_mm")
 
 
-def grasp_scene(task: GraspTask) -> tuple[Scene, RigidBody]:
-    """Return the scene of a grasp, in which the floor is z = 0 and the gripper's axis is z, and its object."""
+def grasp_scene(task: GraspTask) -> Scene:
+    """Return the scene of a grasp: first the fingers, then the object; the floor is z = 0, the gripper's axis is z."""
     design, protocol = task.design, task.design.protocol
     scene = Scene(gravity=(0.0, 0.0, -protocol.si("gravity_m_s2")), friction=protocol.friction_coefficient)
     height = base_height(task.meshes, protocol)
@@ -71,25 +76,51 @@ def grasp_scene(task: GraspTask) -> tuple[Scene, RigidBody]:
         finger = scene.add_soft(mesh.transformed(pose), design.material, elasticity=elasticity, name=f"finger {i + 1}")
         finger.drive("base", replace(motion, start=motion.start + protocol.si("settle_s"), carriers=(lift,)))
     scene.add_plane(name=FLOOR)
-    grasped = scene.add_rigid(
-        task.grasped, position=(0.0, 0.0, task.grasped.rest_height), rotation=task.grasped.rest_rotation
-    )
-    return scene, grasped
+    _add_object(scene, task.grasped)
+    for pair, key in FRICTION.items():
+        coefficient = getattr(protocol, key)
+        if coefficient is not None:
+            for one in _named(scene, task, pair[0]):
+                for other in _named(scene, task, pair[1]):
+                    scene.set_friction(one, other, coefficient)
+    return scene
 
 
-def overlapping_finger(scene: Scene, grasped: RigidBody) -> str | None:
-    """Return the name of a finger that the object overlaps at the start, or None."""
+def _add_object(scene: Scene, grasped: GraspObject) -> None:
+    if grasped.soft is None or grasped.mesh is None:
+        scene.add_rigid(grasped, position=(0.0, 0.0, grasped.rest_height), rotation=grasped.rest_rotation)
+        return
+    material = grasped.soft.material(grasped.mass / grasped.mesh.volume)
+    body = grasped.mesh.transformed(object_pose(grasped))
+    scene.add_soft(body, material, elasticity=grasped.soft.elasticity, name=grasped.name)
+
+
+def object_pose(grasped: GraspObject) -> np.ndarray:
+    """Return the (4, 4) matrix from an object's body frame to where it rests on the floor under the gripper."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[2, 3] = grasped.rest_rotation, grasped.rest_height
+    return pose
+
+
+def _named(scene: Scene, task: GraspTask, what: str) -> list[str]:
+    """Return the names of a grasp's "finger", "object" or "floor" in its scene."""
+    fingers = [body.name for body in scene.soft_bodies[: len(task.meshes)]]
+    return {"finger": fingers, "object": [task.grasped.name], "floor": [FLOOR]}[what]
+
+
+def overlap_at_start(scene: Scene, grasped: GraspObject) -> str | None:
+    """Return a sentence if fingers overlap each other or the object at the start, else None."""
     from finqd.collision import overlaps
 
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = grasped.rotation, grasped.position
-    for finger in scene.soft_bodies:
-        low, high = finger.mesh.vertices.min(axis=0), finger.mesh.vertices.max(axis=0)
-        reach = grasped.shape.bounding_radius
-        if np.all(low <= grasped.position + reach) and np.all(high >= grasped.position - reach):
-            surface = (finger.mesh.vertices, finger.mesh.surface_triangles(), np.eye(4))
-            if overlaps(surface, (grasped.shape.vertices, grasped.shape.triangles, pose)):
-                return finger.name
+    fingers = [body for body in scene.soft_bodies if body.name != grasped.name]
+    surfaces = [(finger.mesh.vertices, finger.mesh.surface_triangles(), np.eye(4)) for finger in fingers]
+    thing = (grasped.vertices, grasped.triangles, object_pose(grasped))
+    for i, (finger, surface) in enumerate(zip(fingers, surfaces, strict=True)):
+        for other, beside in zip(fingers[:i], surfaces, strict=False):
+            if overlaps(beside, surface):
+                return f"the open fingers overlap each other: {other.name} and {finger.name}"
+        if overlaps(surface, thing):
+            return f"{grasped.name} does not fit between the open fingers: it overlaps {finger.name}"
     return None
 
 
@@ -114,21 +145,26 @@ def simulate_grasp(task: GraspTask, *, progress: Callable[[float], None] | None 
 
 def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Trajectory:
     design, protocol = task.design, task.design.protocol
-    scene, grasped = grasp_scene(task)
-    finger = overlapping_finger(scene, grasped)
-    if finger is not None:
-        return Trajectory(
-            status="no_room", reason=f"{task.grasped.name} does not fit between the open fingers: it overlaps {finger}",
-            object_name=task.grasped.name, protocol=protocol,
-        )
+    scene = grasp_scene(task)
+    overlap = overlap_at_start(scene, task.grasped)
+    if overlap is not None:
+        return Trajectory(status="no_room", reason=overlap, object_name=task.grasped.name, protocol=protocol)
     trajectory = simulate(
         scene, duration=grasp_duration(protocol), time_step=protocol.time_step_ms * MS,
         stepper=design.plugin("stepper"), contact=design.plugin("contact"), record=task.record,
         wall_clock_limit=protocol.si("wall_clock_limit_s"), progress=progress, checkpoint=task.checkpoint,
     )
     return replace(
-        trajectory, object_name=task.grasped.name, protocol=protocol, object_drop=object_drop(trajectory, protocol)
+        trajectory, object_name=task.grasped.name, protocol=protocol, object_drop=object_drop(trajectory, protocol),
+        contact_forces=trajectory.contact_forces[:, : len(task.meshes)],
     )
+
+
+def object_heights(trajectory: Trajectory) -> np.ndarray:
+    """Return the height of the centre of mass of a grasp's object [m], (n_frames,); a soft one is the last soft body."""
+    if trajectory.rigid_positions.shape[1]:
+        return trajectory.rigid_positions[:, 0, 2]
+    return trajectory.soft_centres[:, -1, 2]
 
 
 def object_drop(trajectory: Trajectory, protocol: GraspProtocol) -> float:
@@ -138,6 +174,6 @@ def object_drop(trajectory: Trajectory, protocol: GraspProtocol) -> float:
     """
     if trajectory.status != "ok":
         return math.nan
-    heights = trajectory.rigid_positions[:, 0, 2]
+    heights = object_heights(trajectory)
     before = float(np.interp(lift_start(protocol), trajectory.times, heights))
     return before + protocol.si("lift_mm") - float(heights[-1])

@@ -9,6 +9,8 @@ surface file:
 >>> plate = load_object({"shape": {"kind": "box", "size_mm": [60, 40, 5]}, "mass_g": 30})
 >>> f"{1000 * plate.mass:.0f} g, {len(plate.support_points)} corners"
 '30 g, 8 corners'
+
+With ``"soft": {"youngs_modulus_MPa": 0.3}`` in its JSON an object is elastic instead of rigid.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,16 +29,18 @@ from finqd.data import bundled_names, objects_folder
 from finqd.errors import InputError
 from finqd.json_input import read_json_object
 from finqd.mechanics.distance_kernels import DistanceField
+from finqd.mesh import Mesh
 from finqd.object_rest import rest_pose, revolution_supports, surface_supports
 from finqd.object_shapes import KINDS, Shape, refuse_size, shape_from_json, solid_in_surface
 from finqd.options import checked, join, nearest, refuse_unknown, shown
+from finqd.soft_object import SoftPart, soft_mesh, soft_part
 from finqd.surface_files import SUFFIXES, read_surface
 from finqd.units import DEG, GRAM, MM
 
 DENSITY = 1170.0  # of a surface file given without a mass, as of the ten objects [kg/m^3]
 TOPPLING = 2.0 * DEG  # a pose asked for may be this far from one that rests
 
-KEYS = ("name", "shape", "density_kg_m3", "mass_g", "rest_rotation_deg", "note")
+KEYS = ("name", "shape", "density_kg_m3", "mass_g", "rest_rotation_deg", "soft", "note")
 Mass = Annotated[float, Ge(0.01), Le(50_000)]
 Density = Annotated[float, Ge(1), Le(25_000)]
 Angle = Annotated[float, Ge(-360), Le(360)]
@@ -53,7 +57,8 @@ class GraspObject:
     support_points (s, 3) [m]: what can touch a plane; empty for a ball;
     rest_rotation (3, 3), rest_height [m]: body to world rotation, and height of the centre of mass, that rest on z = 0;
     ball_radius [m]: above 0 only for a ball; bounding_radius [m]: about the centre of mass;
-    volume [m^3]; assumptions: sentences to be printed with every result.
+    volume [m^3]; assumptions: sentences to be printed with every result;
+    soft: what makes it elastic, and mesh: of it in the body frame, both None for a rigid one.
     """
 
     name: str
@@ -70,6 +75,8 @@ class GraspObject:
     bounding_radius: float
     volume: float
     assumptions: tuple[str, ...] = ()
+    soft: SoftPart | None = None
+    mesh: Mesh | None = None
 
 
 def object_names() -> tuple[str, ...]:
@@ -143,9 +150,22 @@ def _from_json(
     place = join(where, "rest_rotation_deg") if "rest_rotation_deg" in document else None
     orientation = np.eye(3) if place is None else _rotation(document["rest_rotation_deg"], place)
     shape = shape_from_json(document["shape"], join(where, "shape"), folder)
+    soft = soft_part(document["soft"], join(where, "soft")) if "soft" in document else None
     grams = own_mass if mass_g is None else mass_g
     mass = density * shape.volume if grams is None else grams * GRAM
-    return _placed(label, shape, mass, orientation, place, [f"{label}: {note}"] if note else [])
+    rigid = _placed(label, shape, mass, orientation, place, [f"{label}: {note}"] if note else [])
+    return rigid if soft is None else _softened(rigid, soft, join(where, "soft"))
+
+
+def _softened(rigid: GraspObject, soft: SoftPart, where: str) -> GraspObject:
+    """Return an object as an elastic one. Raises InputError if it cannot be meshed."""
+    mesh = soft_mesh(soft, rigid.vertices, rigid.triangles, where)
+    elements = sum(len(nodes) for nodes in mesh.blocks.values())
+    said = (
+        f"{rigid.name}: elastic, E = {soft.youngs_modulus_MPa:g} MPa, nu = {soft.poisson_ratio:g}, {soft.elasticity}, "
+        f"{elements} tetrahedra"
+    )
+    return replace(rigid, soft=soft, mesh=mesh, assumptions=(*rigid.assumptions, said))
 
 
 def _mass(document: Mapping[str, Any], where: str) -> tuple[float, float | None]:

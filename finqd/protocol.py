@@ -13,8 +13,10 @@ from annotated_types import Ge, Gt, Le
 
 from finqd.units import si_factor
 
+Friction = Annotated[float, Ge(0), Le(5)] | None
 
-def _constant(default: float, description: str) -> Any:
+
+def _constant(default: float | None, description: str) -> Any:
     return field(default=default, metadata={"description": description})
 
 
@@ -26,7 +28,13 @@ class GraspProtocol:
     """
 
     gravity_m_s2: Annotated[float, Ge(0), Le(100)] = _constant(9.81, "acceleration of gravity, downwards")
-    friction_coefficient: Annotated[float, Ge(0), Le(5)] = _constant(0.6, "Coulomb's mu of every pair of surfaces")
+    friction_coefficient: Annotated[float, Ge(0), Le(5)] = _constant(
+        0.6, "Coulomb's mu of every pair of surfaces that has none of its own below"
+    )
+    friction_finger_object: Friction = _constant(None, "mu of fingers and object, if it is another")
+    friction_finger_finger: Friction = _constant(None, "mu of fingers, each other's and their own, if it is another")
+    friction_finger_floor: Friction = _constant(None, "mu of fingers and floor, if it is another")
+    friction_object_floor: Friction = _constant(None, "mu of object and floor, if it is another")
     tip_clearance_mm: Annotated[float, Ge(0), Le(200)] = _constant(
         3.0, "gap between the longest finger's tip and the floor at the start"
     )
@@ -50,6 +58,6 @@ class GraspProtocol:
         """
         return getattr(self, key) * si_factor(key)
 
-    def as_dict(self) -> dict[str, float]:
+    def as_dict(self) -> dict[str, float | None]:
         """Return all constants under their JSON keys."""
         return asdict(self)

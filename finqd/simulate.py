@@ -43,6 +43,7 @@ class _Recorder:
         kinetic = 0.5 * float(np.vdot(system.masses, np.sum(state.velocities**2, axis=1)))
         values = {
             "times": state.time, "rigid_positions": state.rigid_positions, "rigid_rotations": state.rigid_rotations,
+            "soft_centres": system.soft_centres(state.positions),
             "contact_forces": system.contact.soft_forces, "penetrations": self.largest_penetration,
             "stroke": state.progress, "kinetic": kinetic, "elastic": system.elastic_energy(state.positions),
         }

@@ -52,6 +52,7 @@ class Trajectory:
     status: "ok", or why there is no full result ("diverged", "timeout", "mesh_failed", ...); reason: one sentence then
     times [s], (n_frames,)
     rigid_positions: centres of mass [m], (n_frames, n_rigid, 3); rigid_rotations: (n_frames, n_rigid, 3, 3)
+    soft_centres: centres of mass of the soft bodies [m], (n_frames, n_soft, 3)
     contact_forces: sum of the normal forces on each soft body [N], (n_frames, n_soft)
     penetrations: largest since the frame before [m], (n_frames,)
     stroke: share of its time that each drive has run, (n_frames, n_motions)
@@ -69,6 +70,7 @@ class Trajectory:
     times: np.ndarray = _empty(0)
     rigid_positions: np.ndarray = _empty(0, 0, 3)
     rigid_rotations: np.ndarray = _empty(0, 0, 3, 3)
+    soft_centres: np.ndarray = _empty(0, 0, 3)
     contact_forces: np.ndarray = _empty(0, 0)
     penetrations: np.ndarray = _empty(0)
     stroke: np.ndarray = _empty(0, 0)

@@ -170,6 +170,12 @@ class System:
         """Return the rigid bodies' inertias [kg m^2] in the world frame, shape (n_rigid, 3, 3)."""
         return rotations @ self.rigid_inertias @ rotations.transpose(0, 2, 1)
 
+    def soft_centres(self, positions: np.ndarray) -> np.ndarray:
+        """Return the centres of mass of the soft bodies [m], shape (n_soft, 3)."""
+        spans = [slice(b.first_vertex, b.first_vertex + b.mesh.n_vertices) for b in self.scene.soft_bodies]
+        found = [np.average(positions[span], axis=0, weights=self.masses[span]) for span in spans]
+        return np.array(found).reshape(-1, 3)
+
     def advanced_progress(self, state: State, dt: float) -> np.ndarray:
         """Return how far each drive is after a step of ``dt``, given the contact forces at ``state``."""
         forces = self.contact.soft_forces

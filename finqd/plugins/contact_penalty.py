@@ -62,6 +62,14 @@ class Penalty:
     soft_contact: bool = True
     soft_gap_mm: Annotated[float, Gt(0), Le(10)] = 0.1
 
+    @property
+    def effects(self) -> dict[str, str]:
+        """Which effects this model leaves out."""
+        if self.soft_contact:
+            return {}
+        off = "off: contact.soft_contact is false"
+        return {"self_contact": off, "finger_to_finger_contact": off, "soft_object": f"only on the floor; {off[5:]}"}
+
     def potential(self, scene: Scene) -> PenaltyContact:
         """Return the potential of every pair in ``scene`` that can touch."""
         return PenaltyContact(self, scene)

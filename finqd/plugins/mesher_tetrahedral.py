@@ -10,15 +10,14 @@ from annotated_types import Ge, Le
 
 from finqd.errors import MeshError
 from finqd.gmsh_session import gmsh_session
+from finqd.gmsh_tetrahedra import collect, enclose
 from finqd.mesh import Mesh
-from finqd.mesh_reference import MID_EDGES
 from finqd.mesh_sets import with_finger_sets
 from finqd.solid import Prism, Solid, ring_area
 from finqd.units import MM
 
 _ALGORITHMS = (1, 10, 4)  # Delaunay, HXT, frontal: the next one where one fails
 _POOR = 0.02  # scaled Jacobian below which the second optimiser goes over the mesh
-_SHARP = np.radians(30.0)  # a surface is cut into faces along edges sharper than that
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,15 +55,15 @@ class Tetrahedral:
                 if isinstance(solid, Prism):
                     _extrude(gmsh, solid, self.size_mm * MM)
                 else:
-                    _enclose(gmsh, *solid.surface())
+                    enclose(gmsh, *solid.surface())
                 gmsh.model.mesh.generate(3)
-                if self.optimise and _collect(gmsh, 1).quality().scaled_jacobian_min < _POOR:
+                if self.optimise and collect(gmsh, 1).quality().scaled_jacobian_min < _POOR:
                     gmsh.model.mesh.optimize("Netgen")  # slow, and adds vertices
                 if self.order == 2:
                     gmsh.model.mesh.setOrder(2)
             except Exception as error:  # gmsh raises bare exceptions
                 raise MeshError(f"gmsh says: {' '.join(str(error).split())}") from error
-            return _collect(gmsh, self.order)
+            return collect(gmsh, self.order)
 
 
 def _extrude(gmsh: Any, solid: Prism, size: float) -> None:
@@ -75,32 +74,3 @@ def _extrude(gmsh: Any, solid: Prism, size: float) -> None:
         loops.append(geo.addCurveLoop([geo.addLine(a, b) for a, b in zip(ids, [*ids[1:], ids[0]], strict=True)]))
     geo.extrude([(2, geo.addPlaneSurface(loops))], 0.0, 0.0, solid.thickness)
     geo.synchronize()
-
-
-def _enclose(gmsh: Any, vertices: np.ndarray, triangles: np.ndarray) -> None:
-    model = gmsh.model
-    surface = model.addDiscreteEntity(2)
-    model.mesh.addNodes(2, surface, np.arange(1, len(vertices) + 1), np.asarray(vertices, dtype=float).ravel())
-    model.mesh.addElementsByType(surface, 2, [], np.asarray(triangles).ravel() + 1)
-    model.mesh.classifySurfaces(_SHARP, True, True, np.pi)
-    model.mesh.createGeometry()
-    model.geo.addVolume([model.geo.addSurfaceLoop([tag for _, tag in model.getEntities(2)])])
-    model.geo.synchronize()
-
-
-def _collect(gmsh: Any, order: int) -> Mesh:
-    kind, code, count = ("tet4", 4, 4) if order == 1 else ("tet10", 11, 10)
-    _, connectivity = gmsh.model.mesh.getElementsByType(code)
-    if len(connectivity) == 0:
-        raise MeshError("gmsh made no tetrahedra")
-    tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    used, elements = np.unique(connectivity, return_inverse=True)
-    order_of_tags = np.argsort(tags)
-    places = order_of_tags[np.searchsorted(tags, used, sorter=order_of_tags)]
-    vertices = coordinates.reshape(-1, 3)[places]
-    elements = elements.reshape(-1, count)
-    if order == 2:
-        elements = elements[:, [*range(8), 9, 8]]  # gmsh numbers the last two edges the other way round
-        for i, (a, b) in enumerate(MID_EDGES[kind]):  # straight edges, to the last digit
-            vertices[elements[:, 4 + i]] = 0.5 * (vertices[elements[:, a]] + vertices[elements[:, b]])
-    return Mesh(vertices, {kind: elements})
