@@ -161,7 +161,7 @@ def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Tra
 
 
 def object_heights(trajectory: Trajectory) -> np.ndarray:
-    """Return the height of the centre of mass of a grasp's object [m], (n_frames,); a soft one is the last soft body."""
+    """Return the height of a grasp's object, its centre of mass [m], (n_frames,); a soft one is the last soft body."""
     if trajectory.rigid_positions.shape[1]:
         return trajectory.rigid_positions[:, 0, 2]
     return trajectory.soft_centres[:, -1, 2]
