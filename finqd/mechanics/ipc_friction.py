@@ -30,12 +30,10 @@ class ContactRows:
     bodies: np.ndarray
 
     @classmethod
-    def of(cls, rows: list[tuple]) -> ContactRows:
-        """Return contacts from tuples in the order of the fields."""
-        columns = [np.array(column) for column in zip(*rows, strict=True)] if rows else [np.zeros(0)] * 5
-        shapes = ((-1, 4), (-1, 4), (-1, 3), (-1,), (-1, 2))
-        points, weights, normal, force, bodies = (c.reshape(s) for c, s in zip(columns, shapes, strict=True))
-        return cls(points=points.astype(int), weights=weights, normal=normal, force=force, bodies=bodies.astype(int))
+    def empty(cls) -> ContactRows:
+        """Return no contacts."""
+        ids, numbers = np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4))
+        return cls(points=ids, weights=numbers, normal=numbers[:, :3], force=numbers[:, 0], bodies=ids[:, :2])
 
     def joined(self, other: ContactRows) -> ContactRows:
         """Return these contacts and ``other`` ones after them."""

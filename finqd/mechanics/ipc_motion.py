@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,21 @@ CHECKED = 0.02  # and that a way is checked for: what a step may reach must not 
 SAFE = 0.9  # share of the smallest distance that may be used up by motion without any look at triangles
 REACH = 2.0  # mean edges that bodies may move relative to each other, or bend, once their boxes meet: swept boxes
 PATIENCE = 10_000  # iterations of a pair's collision search, after which the share found so far is taken
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Way:
+    """A share of ``moves`` (n, 3) [m] from ``start`` that has been found free, with ``room`` [m] beside it."""
+
+    start: np.ndarray
+    moves: np.ndarray
+    share: float
+    room: float
+
+    def has(self, moves: np.ndarray) -> bool:
+        """Tell whether ``moves`` (n, 3) lead to a point of the way, or so near it that nothing can be between."""
+        share = min(float(np.vdot(moves, self.moves)) / float(np.vdot(self.moves, self.moves)), self.share)
+        return share >= 0.0 and _longest(moves - share * self.moves) <= self.room
 
 
 class Motion:
@@ -34,6 +50,7 @@ class Motion:
         """Drop the candidates: what follows must not depend on what was before."""
         self._anchor: np.ndarray | None = None
         self._candidates: Any = None
+        self._way: _Way | None = None
 
     def near(self, vertices: np.ndarray) -> Any:
         """Return candidates that hold all pairs nearer than the gap at ``vertices`` (n_vertices, 3) [m]."""
@@ -51,15 +68,18 @@ class Motion:
         if 2.0 * farthest <= SAFE * least:
             return 1.0
         share = self._far(start, end - start)
-        candidates = self._along(start, start + share * moves)
-        return share * candidates.compute_collision_free_stepsize(
-            self.surface.mesh, start, np.asfortranarray(start + share * moves), 0.0, self._ccd
-        )
+        end = np.asfortranarray(start + share * moves)
+        candidates = self._along(start, end)
+        share *= candidates.compute_collision_free_stepsize(self.surface.mesh, start, end, 0.0, self._ccd)
+        self._way = _Way(start=start, moves=moves, share=share, room=0.5 * SAFE * KEPT * least)
+        return share
 
     def is_free(self, start: np.ndarray, end: np.ndarray, least: float) -> bool:
         """Tell whether straight ways from ``start`` to ``end`` bring no triangles together; ``least`` as in `limit`."""
         moves = _apart(end - start)
         if 2.0 * _longest(moves) <= SAFE * least:
+            return True
+        if self._way is not None and self._way.start is start and self._way.has(moves):
             return True
         if self._far(start, end - start) < 1.0:
             return False
@@ -115,7 +135,9 @@ class Motion:
         return share
 
 
-def _box_entry(low: np.ndarray, high: np.ndarray, other_low: np.ndarray, other_high: np.ndarray, move: np.ndarray) -> float:
+def _box_entry(
+    low: np.ndarray, high: np.ndarray, other_low: np.ndarray, other_high: np.ndarray, move: np.ndarray
+) -> float:
     """Return the share of ``move`` (3,) after which a box first meets another one; inf: never on the way."""
     first, last = 0.0, 1.0
     for a in range(3):

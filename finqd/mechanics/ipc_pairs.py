@@ -72,21 +72,22 @@ class PairBarrier:
 
     def rows(self, pairs: Any, vertices: np.ndarray) -> ContactRows:
         """Return the contacts with their normal forces, the mollified ones of nearly parallel edges included."""
-        found = []
-        for i in range(len(pairs)):
+        n = len(pairs)
+        points, weights, push = np.zeros((n, 4), dtype=np.int64), np.zeros((n, 4)), np.zeros((n, 3))
+        for i in range(n):
             ids = self._ids(pairs[i])
             places = vertices[ids].ravel()
-            weights = np.asarray(pairs[i].compute_coefficients(places))
-            vector = weights @ places.reshape(-1, 3)
-            distance = float(np.linalg.norm(vector))
-            forces = -np.asarray(self.potential.gradient(pairs[i], places)).reshape(-1, 3)
-            normal = vector / distance
-            first = weights > 0.0
-            push = float(forces[first].sum(axis=0) @ normal)
-            pad = 4 - len(ids)
-            bodies = self.body[ids[int(np.argmax(weights))]], self.body[ids[int(np.argmin(weights))]]
-            found.append((np.pad(ids, (0, pad)), np.pad(weights, (0, pad)), normal, max(push, 0.0), bodies))
-        return ContactRows.of(found)
+            own = np.asarray(pairs[i].compute_coefficients(places))
+            points[i, : len(ids)], weights[i, : len(ids)] = ids, own
+            push[i] = (own <= 0.0) @ np.asarray(self.potential.gradient(pairs[i], places)).reshape(-1, 3)
+        normal = np.einsum("mk,mkx->mx", weights, vertices[points])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        each = np.arange(n)
+        sides = points[each, np.argmax(weights, axis=1)], points[each, np.argmin(weights, axis=1)]
+        return ContactRows(
+            points=points, weights=weights, normal=normal, bodies=np.stack([self.body[side] for side in sides], axis=1),
+            force=np.maximum(np.einsum("mx,mx->m", push, normal), 0.0),
+        )
 
     def crossing(self, vertices: np.ndarray) -> tuple[int, int] | None:
         """Return the numbers of two bodies whose surfaces intersect or touch at ``vertices``, None if there are none."""

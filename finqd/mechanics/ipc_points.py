@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -24,6 +25,16 @@ class Points:
     rigid: np.ndarray
     arms: np.ndarray
 
+    @cached_property
+    def riding(self) -> np.ndarray:
+        """Which points are those of soft vertices, shape (m,)."""
+        return np.flatnonzero(self.soft >= 0)
+
+    @cached_property
+    def of_bodies(self) -> dict[int, np.ndarray]:
+        """Which points each rigid body has, by its number, each of shape (m,)."""
+        return {int(body): np.flatnonzero(self.rigid == body) for body in np.unique(self.rigid[self.rigid >= 0])}
+
     def with_rigid(self, rigid: np.ndarray, arms: np.ndarray) -> Points:
         """Return these points and after them those at ``arms`` (m, 3) [m] of bodies ``rigid`` (m,)."""
         return Points(
@@ -34,9 +45,9 @@ class Points:
     def at(self, state: State) -> np.ndarray:
         """Return where the points are [m], shape (n, 3)."""
         found = self._turned_arms(state)
-        hard = self.soft < 0
-        found[hard] += state.rigid_positions[self.rigid[hard]]
-        found[~hard] = state.positions[self.soft[~hard]]
+        for body, mine in self.of_bodies.items():
+            found[mine] += state.rigid_positions[body]
+        found[self.riding] = state.positions[self.soft[self.riding]]
         return found
 
     def add_gradient(self, state: State, gradient: np.ndarray, derivatives: Derivatives) -> None:
@@ -44,8 +55,7 @@ class Points:
 
         .. math:: dx = dc + d\\varphi \\times R y \\Rightarrow dE/dc = g, \\; dE/d\\varphi = R y \\times g
         """
-        soft = np.flatnonzero(self.soft >= 0)
-        derivatives.soft[self.soft[soft]] += gradient[soft]
+        derivatives.soft[self.soft[self.riding]] += gradient[self.riding]
         hard = np.flatnonzero((self.soft < 0) & gradient.any(axis=1))
         if len(hard):
             turning = np.cross(self._turned_arms(state)[hard], gradient[hard])
@@ -97,9 +107,8 @@ class Points:
 
     def _turned_arms(self, state: State) -> np.ndarray:
         turned = np.zeros((len(self.soft), 3))
-        for body, rotation in enumerate(state.rigid_rotations):
-            mine = self.rigid == body
-            turned[mine] = self.arms[mine] @ rotation.T
+        for body, mine in self.of_bodies.items():
+            turned[mine] = self.arms[mine] @ state.rigid_rotations[body].T
         return turned
 
     def _jacobians(self, state: State, which: np.ndarray) -> np.ndarray:

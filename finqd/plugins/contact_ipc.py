@@ -14,7 +14,7 @@ from finqd.mechanics.ipc_barrier import HALF_GAP, PlaneBarrier, PlaneContacts
 from finqd.mechanics.ipc_friction import ContactRows, Friction
 from finqd.mechanics.ipc_motion import KEPT, NEAR, Motion
 from finqd.mechanics.ipc_pairs import PairBarrier
-from finqd.mechanics.ipc_points import BlockSlots
+from finqd.mechanics.ipc_points import BlockSlots, Points
 from finqd.mechanics.ipc_surface import IpcSurface
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.state import Direction, State
@@ -22,6 +22,7 @@ from finqd.mechanics.system import Derivatives
 from finqd.scene import Scene
 from finqd.units import MM
 
+SUPPORT = 5.0  # [N] that a contact of rigid bodies or with a plane holds at half the gap at least: grasps press on floors
 HALVINGS = 40  # of the way of bodies that turn, until it counts as blocked
 SHORTEST = 1e-12  # share of a direction that is always left: what goes nowhere fails in the line search
 
@@ -70,8 +71,8 @@ class _Situation:
     places: of all points [m], (n_points, 3); vertices: those of the surface, (n_vertices, 3)
     pairs: `ipctk.NormalCollisions`, None where the way here is not free; planes: contacts with planes
     energy: of all barriers [J], inf if something intersects; least: no more than the smallest distance of pairs [m]
-    gradient: of the barriers [N], (n_points, 3), None before it is asked for; second: pairs of points and second
-        derivatives of the barriers, of which projected or not was asked for
+    gradient: of the barriers [N], (n_points, 3); rows: with normal forces; both None before they are asked for
+    second: pairs of points and second derivatives of the barriers, of which projected or not was asked for
     """
 
     state: State
@@ -82,6 +83,7 @@ class _Situation:
     energy: float = np.inf
     least: float = 0.0
     gradient: np.ndarray | None = None
+    rows: ContactRows | None = None
     second: dict[bool, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     def is_of(self, state: State) -> bool:
@@ -109,7 +111,7 @@ class IpcContact:
         self.motion = Motion(self.surface, gap=self.gap)
         # the area that holds a rigid body at half the gap; under weightless conditions 1 g stands in for gravity
         weight = max(float(np.linalg.norm(scene.gravity)), 9.81)
-        own = [0.0 if body.held else body.shape.mass * weight / half for body in scene.rigid_bodies]
+        own = [0.0 if body.held else max(body.shape.mass * weight, SUPPORT) / half for body in scene.rigid_bodies]
         supports = np.array([0.0] * len(scene.soft_bodies) + own)
         self.pairs = PairBarrier(
             self.surface, self.motion, gap=self.gap, pressure=half / HALF_GAP, supports=supports
@@ -125,7 +127,8 @@ class IpcContact:
         self.penetration = 0.0
         self.start: State | None = None  # of the step
         self.friction: Friction | None = None
-        self.riders = self.points  # and after them where balls touched planes when friction was renewed
+        self.lowest = _NOWHERE  # where balls touched planes when friction was renewed
+        self.riders = self.points  # these and after them the lowest ones
         self.shares = np.zeros(len(self.points.soft))  # of the normal forces that friction counts with, by point [N]
         self._now: _Situation | None = None
         self._free: list[_Situation] = []  # of this step, known to be free, the last one last
@@ -153,7 +156,8 @@ class IpcContact:
         self.motion.forget()
         self._free, self._now = [], None
         self.friction = None
-        self._now = self._situation(state, free=known is not None or self._intersecting(state) is None)
+        places = self.points.at(state)
+        self._now = self._situation(state, places, free=known is not None or self._intersecting(state) is None)
         self._free = [self._now]
         self.start = state
         self.relag(state, whole=True)
@@ -243,7 +247,8 @@ class IpcContact:
         """Return the contacts at ``state``."""
         known = self._known(state)
         if known is None:
-            known = self._situation(state, free=self._is_reached(state))
+            places = self.points.at(state)
+            known = self._situation(state, places, free=self._is_reached(state, places))
         self._now = known
         return known
 
@@ -253,19 +258,18 @@ class IpcContact:
             self._free = [*(one for one in self._free if one is not now), now]
         return now
 
-    def _is_reached(self, state: State) -> bool:
+    def _is_reached(self, state: State, places: np.ndarray) -> bool:
         """Tell whether there is a way to ``state`` on which nothing meets, from where the last ways began or ended."""
         if not self._free:
             return self._intersecting(state) is None
-        vertices = self._vertices(self.points.at(state))
+        vertices = self._vertices(places)
         origins = [self._free[-1]]
         if self._now is not None and self._now is not origins[0] and np.isfinite(self._now.energy):
             origins.append(self._now)
         return any(self.motion.is_free(one.vertices, vertices, one.least) for one in origins)
 
-    def _situation(self, state: State, *, free: bool) -> _Situation:
-        """Find the contacts at ``state``; not ``free``: something intersects."""
-        places = self.points.at(state)
+    def _situation(self, state: State, places: np.ndarray, *, free: bool) -> _Situation:
+        """Find the contacts at ``state``, where points are at ``places``; not ``free``: something intersects."""
         vertices, planes = self._vertices(places), self.planes.contacts(places)
         now = _Situation(state=state, places=places, vertices=vertices, pairs=None, planes=planes)
         if free and np.isfinite(planes.energy):
@@ -276,15 +280,18 @@ class IpcContact:
 
     def _rows(self, now: _Situation) -> ContactRows:
         """Return all contacts with their normal forces."""
+        if now.rows is not None:
+            return now.rows
         if not np.isfinite(now.energy):
-            return ContactRows.of([])
+            return ContactRows.empty()
         planes, first = now.planes, len(self.scene.soft_bodies) + len(self.scene.rigid_bodies)
         one = np.arange(4) == 0
         on_planes = ContactRows(
             points=planes.point[:, None] * one, weights=np.ones((len(planes.point), 1)) * one, normal=planes.normal,
             force=planes.force, bodies=np.stack([self.surface.body[planes.point], first + planes.plane], axis=1),
         )
-        return self.pairs.rows(now.pairs, now.vertices).joined(on_planes)
+        now.rows = self.pairs.rows(now.pairs, now.vertices).joined(on_planes)
+        return now.rows
 
     def _renew_friction(self, state: State, rows: ContactRows) -> None:
         """Make friction of ``rows`` at ``state``; that of a ball on a plane is at its lowest point."""
@@ -294,6 +301,7 @@ class IpcContact:
         bodies = self.points.rigid[first[balls]]
         radii = np.array([self.scene.rigid_bodies[r].shape.ball_radius for r in bodies])
         arms = np.einsum("nij,ni->nj", state.rigid_rotations[bodies], -radii[:, None] * rows.normal[balls])
+        self.lowest = _NOWHERE.with_rigid(bodies, arms)
         self.riders = self.points.with_rigid(bodies, arms)
         points = rows.points.copy()
         points[balls, 0] = len(self.points.soft) + np.arange(len(balls))
@@ -303,7 +311,7 @@ class IpcContact:
 
     def _riding(self, now: _Situation) -> np.ndarray:
         """Return where the points are that friction acts on [m], (n_riders, 3): all, and where balls touch planes."""
-        return now.places if self.riders is self.points else self.riders.at(now.state)
+        return np.concatenate([now.places, self.lowest.at(now.state)])
 
     def _gradient(self, now: _Situation) -> np.ndarray:
         """Return the derivatives of all energies to all points [N], shape (n_riders, 3)."""
@@ -359,6 +367,9 @@ class IpcContact:
             one, other = (self.names[number] for number in found)
             what = f"{one!r} and {other!r} intersect" if one != other else f"{one!r} intersects itself"
             raise InputError(f"{what} (or touch) at the start: the contact ipc needs them apart")
+
+
+_NOWHERE = Points(soft=np.zeros(0, dtype=np.int64), rigid=np.zeros(0, dtype=np.int64), arms=np.zeros((0, 3)))
 
 
 def _start(scene: Scene) -> State:
