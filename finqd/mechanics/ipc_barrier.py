@@ -1,6 +1,7 @@
 r"""The barrier of incremental potential contact, on planes; the IPC Toolkit has the same one between triangles.
 
-.. math:: E = A \\kappa \\hat d\\, b(d^2/\\hat d^2), \\qquad b(z) = -(z - 1)^2 \\ln z \\text{ for } z < 1, \\text{ else } 0
+.. math:: E = A \\kappa \\hat d\\, b(d^2/\\hat d^2), \\qquad b(z) = -(z - 1)^2 \\ln z \\text{ for } z < 1,
+    \\text{ else } 0
 
 with the gap d, the area A that a vertex stands for and a pressure kappa. It is twice continuously differentiable,
 nothing at d^ and infinite at 0. Source: Li et al., Incremental Potential Contact, ACM Trans. Graph. 39 (2020) 49,

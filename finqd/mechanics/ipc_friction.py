@@ -1,6 +1,7 @@
 r"""Friction of incremental potential contact: Coulomb's law at lagged normal forces, smooth about no slip.
 
-.. math:: E = \\mu N f_0(|s|), \\quad f_0' = f_1(y) = 2 y/\\epsilon - y^2/\\epsilon^2 \\text{ for } y < \\epsilon, \\text{ else } 1
+.. math:: E = \\mu N f_0(|s|), \\quad f_0' = f_1(y) = 2 y/\\epsilon - y^2/\\epsilon^2 \\text{ for } y < \\epsilon,
+    \\text{ else } 1
 
 with the tangential slip s since the start of the step. Source: Li et al., Incremental Potential Contact, ACM Trans.
 Graph. 39 (2020) 49, equations 10 to 15, where epsilon is a speed times the step.
@@ -40,11 +41,16 @@ class ContactRows:
         names = ("points", "weights", "normal", "force", "bodies")
         return ContactRows(**{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names})
 
-    def shares(self, n_points: int) -> np.ndarray:
-        """Return the normal force that each point takes part in [N], (n_points,): it is steady when contacts slide."""
+    def shares(self, values: np.ndarray, n_points: int) -> np.ndarray:
+        """Return what each point takes of the contacts' ``values`` (m,), (n_points,): steady when they slide."""
         found = np.zeros(n_points)
-        np.add.at(found, self.points, np.abs(self.weights) * self.force[:, None])
+        np.add.at(found, self.points, np.abs(self.weights) * values[:, None])
         return found
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean of ``values`` (n_points,) over the points of each contact, by their weights, (m,)."""
+        weights = np.abs(self.weights)
+        return np.sum(weights * values[self.points], axis=1) / np.sum(weights, axis=1)
 
 
 class Friction:

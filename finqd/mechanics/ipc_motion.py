@@ -13,7 +13,8 @@ NEAR = 5.0  # gaps within which candidates are kept: they hold until vertices ha
 KEPT = 0.1  # share of the distance of any two triangles that a step leaves at least,
 CHECKED = 0.02  # and that a way is checked for: what a step may reach must not be refused for rounding
 SAFE = 0.9  # share of the smallest distance that may be used up by motion without any look at triangles
-REACH = 2.0  # mean edges that bodies may move relative to each other, or bend, once their boxes meet: swept boxes
+REACH = 2.0  # mean edges, of the coarser one, that bodies may move relative to each other once their boxes meet,
+FREE = 10.0  # or so many gaps: beyond, swept boxes meet too many others
 PATIENCE = 10_000  # iterations of a pair's collision search, after which the share found so far is taken
 
 
@@ -40,7 +41,10 @@ class Motion:
 
     def __init__(self, surface: IpcSurface, *, gap: float) -> None:
         self.surface, self.gap = surface, gap
-        self.body = surface.body[: surface.n_vertices]
+        body = surface.body[: surface.n_vertices]
+        numbers = np.unique(body)
+        self.members = [np.flatnonzero(body == number) for number in numbers]
+        self.reach = [max(REACH * surface.edge_lengths[number], FREE * gap) for number in numbers]
         toolkit_ = toolkit()
         self._ccd = toolkit_.AdditiveCCD(PATIENCE, 1.0 - KEPT)
         self._check = toolkit_.AdditiveCCD(PATIENCE, 1.0 - CHECKED)
@@ -115,19 +119,17 @@ class Motion:
         Bodies fly freely until their boxes meet, and by `REACH` from there on: otherwise a wild direction would sweep
         every triangle across all others, whose pairs fill the memory.
         """
-        numbers, reach = np.unique(self.body), REACH * self.surface.edge_length
         low, high, mean, bend = [], [], [], []
-        for number in numbers:
-            mine = self.body == number
+        for mine in self.members:
             mean.append(moves[mine].mean(axis=0))
             bend.append(_longest(moves[mine] - mean[-1]))
             low.append(start[mine].min(axis=0) - self.gap)
             high.append(start[mine].max(axis=0) + self.gap)
-        share = min(1.0, reach / max(*bend, reach))
-        for i in range(len(numbers)):
+        share = 1.0
+        for i in range(len(mean)):
+            share = min(share, self.reach[i] / max(bend[i], self.reach[i]))
             for j in range(i):
-                wide = bend[i] + bend[j]
-                relative = mean[i] - mean[j]
+                wide, relative, reach = bend[i] + bend[j], mean[i] - mean[j], max(self.reach[i], self.reach[j])
                 path = float(np.linalg.norm(relative)) + wide
                 if path > reach:
                     meets = _box_entry(low[i] - wide, high[i] + wide, low[j], high[j], relative)

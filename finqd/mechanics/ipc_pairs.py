@@ -1,4 +1,4 @@
-"""The barrier between triangles, edges and vertices of one surface, by the IPC Toolkit (whose distances are squared)."""
+"""The barrier between primitives of one surface, by the IPC Toolkit (whose distances are squared ones)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ class PairBarrier:
     What the toolkit gives for one pair is not to be kept: it lives no longer than the set that it belongs to.
     """
 
-    def __init__(self, surface: IpcSurface, motion: Motion, *, gap: float, pressure: float, supports: np.ndarray) -> None:
+    def __init__(
+        self, surface: IpcSurface, motion: Motion, *, gap: float, pressure: float, supports: np.ndarray
+    ) -> None:
         """gap [m]; pressure: kappa [Pa]; supports: by body, an area that holds its weight [m^2], 0 for soft ones."""
         self.surface, self.motion, self.gap, self.supports = surface, motion, gap, supports
         self.potential = toolkit().BarrierPotential(gap, pressure, True)
@@ -90,7 +92,7 @@ class PairBarrier:
         )
 
     def crossing(self, vertices: np.ndarray) -> tuple[int, int] | None:
-        """Return the numbers of two bodies whose surfaces intersect or touch at ``vertices``, None if there are none."""
+        """Return the numbers of two bodies whose surfaces intersect or touch at ``vertices``; None: there are none."""
         ipctk, mesh = toolkit(), self.surface.mesh
         if ipctk.has_intersections(mesh, vertices, ipctk.LBVH()):
             broad = ipctk.LBVH()

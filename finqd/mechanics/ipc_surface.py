@@ -40,7 +40,7 @@ class IpcSurface:
     n_vertices: how many are vertices; triangles (n_triangles, 3), edges (n_edges, 2): of these
     body: of each point, held: whether nothing can move it, both of shape (n_points,)
     areas: a third of the triangles around each vertex, at rest [m^2], 0 for centres, shape (n_points,)
-    edge_length: mean over all edges [m]
+    edge_lengths: mean of each body's edges [m]
     mesh: all that, as an `ipctk.CollisionMesh`
     """
 
@@ -56,7 +56,8 @@ class IpcSurface:
         if excluded:
             self.mesh.can_collide &= ipctk.make_sparse_filter(dict.fromkeys(sorted(excluded), False), True)
         lengths = np.linalg.norm(self._rest[self.edges[:, 0]] - self._rest[self.edges[:, 1]], axis=1)
-        self.edge_length = float(lengths.mean()) if len(lengths) else gap
+        ends = self.body[self.edges[:, 0]]
+        self.edge_lengths = np.bincount(ends, lengths) / np.maximum(np.bincount(ends), 1)
         self.areas = np.zeros(len(self.points.soft))
         self.areas[: self.n_vertices] = self.mesh.vertex_areas
 

@@ -22,7 +22,8 @@ from finqd.mechanics.system import Derivatives
 from finqd.scene import Scene
 from finqd.units import MM
 
-SUPPORT = 5.0  # [N] that a contact of rigid bodies or with a plane holds at half the gap at least: grasps press on floors
+SUPPORT = 5.0  # [N] that one contact of rigid bodies or planes holds at half the gap at least: grasps press on floors
+LEAST_SHARE = 0.4  # of the way to their new values that friction bounds go at least in a renewal
 HALVINGS = 40  # of the way of bodies that turn, until it counts as blocked
 SHORTEST = 1e-12  # share of a direction that is always left: what goes nowhere fails in the line search
 
@@ -129,7 +130,9 @@ class IpcContact:
         self.friction: Friction | None = None
         self.lowest = _NOWHERE  # where balls touched planes when friction was renewed
         self.riders = self.points  # these and after them the lowest ones
-        self.shares = np.zeros(len(self.points.soft))  # of the normal forces that friction counts with, by point [N]
+        self.bounds = np.zeros(len(self.points.soft))  # of friction, by the points that take part in it [N]
+        self._missing: np.ndarray | None = None  # what the last renewal of this step found missing in them [N]
+        self._share = 1.0  # of which it took that share
         self._now: _Situation | None = None
         self._free: list[_Situation] = []  # of this step, known to be free, the last one last
         self._refuse_intersections()
@@ -159,22 +162,42 @@ class IpcContact:
         places = self.points.at(state)
         self._now = self._situation(state, places, free=known is not None or self._intersecting(state) is None)
         self._free = [self._now]
-        self.start = state
+        self.start, self._missing = state, None
         self.relag(state, whole=True)
 
     def relag(self, state: State, *, whole: bool = False) -> float:
-        """Renew the friction bounds at ``state``; return which share of the normal forces has changed, point by point.
+        """Renew the friction bounds at ``state``; return which share of them, in sum over points, has changed.
 
-        Always without relaxation. How contacts are parted into pairs changes as they slide; what a point bears does not.
+        How contacts are parted into pairs changes as they slide; what each point bears does not. ``whole``: without
+        relaxation.
         """
         now = self._keep(self._at(state))
         rows = self._rows(now)
-        shares = rows.shares(len(self.points.soft))
-        total = max(float(shares.sum()), float(self.shares.sum()))
-        change = float(np.abs(shares - self.shares).sum()) / total if total > 0.0 else 0.0
-        self.shares, self.relagged_forces = shares, self._forces_by_body(rows)
-        self._renew_friction(state, rows)
-        return change
+        bound = self.coefficients[tuple(rows.bodies.T)] * rows.force
+        wanted = rows.shares(bound, len(self.points.soft))
+        missing = wanted - self.bounds
+        total = max(float(wanted.sum()), float(self.bounds.sum()))
+        self.bounds = wanted if whole else self.bounds + self._relaxation(missing) * missing
+        self.relagged_forces = self._forces_by_body(rows)
+        taken = np.divide(self.bounds, wanted, out=np.ones_like(wanted), where=wanted > 0.0)
+        self._renew_friction(state, rows, bound * rows.mean(taken))
+        return float(np.abs(missing).sum()) / total if total > 0.0 else 0.0
+
+    def _relaxation(self, missing: np.ndarray) -> float:
+        """Return which share of what is ``missing`` in the bounds (n_points,) [N] to add: Aitken's, the first time all.
+
+        Full renewals swing about Coulomb's law for ever where friction carries much of the load.
+        Source: Kuettler and Wall, Comput. Mech. 43 (2008) 61, equation 44.
+        """
+        before, self._missing = self._missing, missing
+        if before is None:
+            self._share = 1.0
+        else:
+            turn = missing - before
+            size = float(np.vdot(turn, turn))
+            if size > 0.0:
+                self._share = min(max(-self._share * float(np.vdot(before, turn)) / size, LEAST_SHARE), 1.0)
+        return self._share
 
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J], inf where something intersects or may have passed through."""
@@ -201,10 +224,10 @@ class IpcContact:
     def couplings(self, state: State) -> np.ndarray:
         """Return the pairs of vertices, (n, 2), that the Hessian lacks at ``state``; with them those that are near."""
         now = self._at(state)
-        if not np.isfinite(now.energy) or not len(self._missing(self._second_derivatives(now, projected=False)[0])):
+        if not np.isfinite(now.energy) or not len(self._lacking(self._second_derivatives(now, projected=False)[0])):
             return np.zeros((0, 2), dtype=np.int64)
         near = self.pairs.near_vertices(now.vertices, NEAR * self.gap)
-        return self._missing(np.concatenate([self._second_derivatives(now, projected=False)[0], near]))
+        return self._lacking(np.concatenate([self._second_derivatives(now, projected=False)[0], near]))
 
     def step_limit(self, state: State, direction: Direction) -> float:
         """Return the share (0, 1] of ``direction`` up to which nothing meets: a tenth of each distance is left."""
@@ -293,9 +316,8 @@ class IpcContact:
         now.rows = self.pairs.rows(now.pairs, now.vertices).joined(on_planes)
         return now.rows
 
-    def _renew_friction(self, state: State, rows: ContactRows) -> None:
-        """Make friction of ``rows`` at ``state``; that of a ball on a plane is at its lowest point."""
-        bound = self.coefficients[tuple(rows.bodies.T)] * rows.force
+    def _renew_friction(self, state: State, rows: ContactRows, bound: np.ndarray) -> None:
+        """Make friction of ``rows`` at ``state`` with bounds mu N [N]; a ball's on a plane is at its lowest point."""
         first = rows.points[:, 0]
         balls = np.flatnonzero((first >= self.surface.n_vertices) & (bound > 0.0))
         bodies = self.points.rigid[first[balls]]
@@ -337,7 +359,7 @@ class IpcContact:
         more, others = self.friction.hessian(self._riding(now))
         return np.concatenate([pairs, more]), np.concatenate([blocks, others])
 
-    def _missing(self, pairs: np.ndarray) -> np.ndarray:
+    def _lacking(self, pairs: np.ndarray) -> np.ndarray:
         """Return the pairs of soft vertices among ``pairs`` of points (k, 2) that have no block, each once, (n, 2)."""
         soft = self.riders.soft[pairs]
         soft = np.unique(soft[(soft[:, 0] >= 0) & (soft[:, 0] < soft[:, 1])], axis=0)
