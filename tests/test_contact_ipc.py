@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from finqd.errors import InputError
-from finqd.mechanics import ipc_points
 from finqd.mechanics.ipc_barrier import HALF_GAP, barrier
-from finqd.mechanics.ipc_surface import TRIANGLES, soft_triangles, toolkit
+from finqd.mechanics.ipc_points import Points
+from finqd.mechanics.ipc_surface import toolkit
 from finqd.mechanics.material import Material
 from finqd.mechanics.rotation_kernels import rotation_matrix
 from finqd.mechanics.state import Direction, State
 from finqd.mechanics.system import System
+from finqd.mesh import Mesh
 from finqd.mesh_shapes import box_mesh
 from finqd.objects import load_object
 from finqd.plugins.contact_ipc import Ipc
@@ -140,3 +142,189 @@ def assert_hessian(system: System, state: State, matrix: np.ndarray) -> None:
     for seed in range(3, 6):
         _, turn, way = differences(system, state, seed, 1e-10)
         assert np.abs(matrix @ way - turn).max() < 1e-4 * np.abs(turn).max()
+
+
+def test_a_wrong_sign_of_the_rotations_bend_is_noticed(monkeypatch):
+    right = Points.add_curvature
+    monkeypatch.setattr(Points, "add_curvature", lambda self, state, gradient, d: right(self, state, -gradient, d))
+    system = touching("rigid on soft")
+    state = slipping(system)
+    with pytest.raises(AssertionError):
+        assert_hessian(system, state, hessian(system, state))
+
+
+def test_planes_have_the_barrier_of_the_toolkit():
+    z = np.array([1e-3, 0.1, 0.25, 0.9, 1.0, 2.0])
+    assert barrier(z)[0][:5] == pytest.approx([toolkit().barrier(d, 1.0) for d in z[:5]], rel=1e-12)
+    assert barrier(z)[0][5] == 0.0 and np.isinf(barrier(np.array([0.0, -1.0]))[0]).all()
+    assert -barrier(np.array([0.25]))[1][0] == pytest.approx(HALF_GAP)
+
+
+# -- laws --------------------------------------------------------------------------------------------------------------
+
+
+def run(scene: Scene, *, duration: float, dt: float = 0.01, **options):
+    """Simulate with the contact ipc; return the states after every step, and the system."""
+    states, systems = [], []
+
+    def watch(system: System, state: State) -> None:
+        states.append(state)
+        systems.append(system)
+
+    found = simulate(scene, duration=duration, time_step=dt, contact="ipc", watch=watch, **options)
+    assert found.status == "ok", found.reason
+    return states, systems[-1], found
+
+
+@pytest.mark.parametrize(("slope", "slides"), [(0.28, False), (0.32, True)])
+def test_coulombs_law_on_a_slope(slope, slides):
+    down = 9.81 * np.array([slope, 0.0, -1.0]) / np.hypot(slope, 1.0)
+    scene = Scene(gravity=down, friction=0.3)
+    scene.add_plane()
+    scene.add_rigid(thing(BRICK), position=(0.0, 0.0, 3.0 * MM))
+    states, _, _ = run(scene, duration=0.3)
+    way = np.array([state.rigid_positions[0, 0] for state in states])
+    if slides:
+        assert states[-1].rigid_velocities[0, 0] == pytest.approx(0.3 * (down[0] + 0.3 * down[2]), rel=0.05)
+    else:  # it creeps, as the docstring says, by less than slip_mm a step
+        assert np.ptp(way[5:]) < len(way) * 1e-6
+
+
+def test_a_soft_block_that_is_pulled_sticks_up_to_mu_n():
+    ends = {}
+    for pull in (0.9, 1.1):
+        scene = Scene(friction=0.5)
+        box(scene, (0.0, 0.0, -10.0 * MM), name="lower").fix("zmin")
+        upper = box(scene, (2.0 * MM, 2.0 * MM, 0.05 * MM), size=0.8 * SIZE, name="upper")
+        weight = float(RUBBER.density * np.prod(0.8 * SIZE) * 9.81)
+        upper.load(np.arange(upper.mesh.n_vertices), (0.5 * pull * weight, 0.0, 0.0))
+        states, _, _ = run(scene, duration=0.2)
+        mine = slice(upper.first_vertex, None)
+        ends[pull] = states[-1].positions[mine, 0].mean() - states[4].positions[mine, 0].mean()
+    assert abs(ends[0.9]) < 20e-6
+    assert ends[1.1] > 4.0 * abs(ends[0.9])
+
+
+def free_of_intersections(system: System, state: State) -> bool:
+    contact = system.contact
+    vertices = contact.points.at(state)[: contact.surface.n_vertices]
+    return not toolkit().has_intersections(contact.surface.mesh, np.asfortranarray(vertices))
+
+
+@pytest.mark.parametrize("below", ["plane", "ball", "soft"])
+def test_what_is_dropped_comes_to_rest(below):
+    scene = Scene()
+    if below == "plane":
+        scene.add_plane()
+    elif below == "ball":
+        scene.add_rigid(thing({"kind": "sphere", "diameter_mm": 40}), position=(0.0, 0.0, -20.0 * MM), held=True)
+    else:
+        scene.add_plane(point=(0.0, 0.0, -10.0 * MM))
+        box(scene, (-10.0 * MM, -10.0 * MM, -10.0 * MM), name="lower")
+    body = box(scene, (-10.0 * MM, -10.0 * MM, 1.0 * MM), name="upper", cells=(4, 4, 2))
+    states, system, found = run(scene, duration=0.6)
+    mine = slice(body.first_vertex, None)
+    heights = [state.positions[mine, 2].mean() - 5.0 * MM for state in states]
+    assert -0.4 * MM < heights[-1] < 0.1 * MM
+    assert np.ptp(heights[-10:]) < 2e-6
+    assert free_of_intersections(system, states[-1])
+    assert found.penetrations.max() < 0.1 * MM
+    weight = RUBBER.density * np.prod(SIZE) * 9.81
+    assert system.contact.soft_forces[-1] == pytest.approx(weight, rel=0.02 if below == "plane" else 0.1)
+
+
+def test_a_squeeze_ends_without_intersection_and_forces_balance():
+    scene = Scene(gravity=(0.0, 0.0, 0.0))
+    box(scene, (0.0, 0.0, -10.0 * MM), cells=(3, 3, 2), name="lower").fix("zmin")
+    upper = box(scene, (6.0 * MM, 5.0 * MM, 0.3 * MM), cells=(3, 3, 2), size=0.6 * SIZE, name="upper", turn=0.4)
+    upper.drive("zmax", Motion(path=Shift(vector=(0.0, 0.0, -3.0 * MM)), duration=0.1))
+    states, system, _ = run(scene, duration=0.12)
+    assert free_of_intersections(system, states[-1])
+    lower, higher = system.contact.soft_forces
+    assert lower == pytest.approx(higher) and lower > 5.0
+    assert system.contact.penetration == 0.0
+
+
+# -- what is refused, excluded and repeated ----------------------------------------------------------------------------
+
+
+def test_bodies_that_start_in_each_other_are_refused_by_name():
+    scene = Scene()
+    box(scene, (0.0, 0.0, 0.0), name="cushion")
+    scene.add_rigid(thing(BRICK), position=(10.0 * MM, 10.0 * MM, 11.0 * MM), name="brick")
+    with pytest.raises(InputError, match="'cushion' and 'brick'|'brick' and 'cushion'"):
+        Ipc().potential(scene)
+    below = Scene()
+    below.add_plane(name="floor")
+    box(below, (0.0, 0.0, -0.2 * MM), name="cushion")
+    with pytest.raises(InputError, match="'cushion' and 'floor'"):
+        Ipc().potential(below)
+
+
+@pytest.mark.parametrize("through", [1.0 * MM, 40.0 * MM])
+def test_a_state_behind_a_wall_has_no_finite_energy(through):
+    """Neither one that intersects nor one that has passed through as a whole, which no distance shows."""
+    system = touching("rigid on soft")
+    start = system.initial_state()
+    system.contact.begin_step(start)
+    way = system.zero_direction()
+    way.rigid[0, 2] = -through
+    assert np.isfinite(system.contact.energy(start)) and np.isinf(system.contact.energy(start.moved(way)))
+    share = system.contact.step_limit(start, way)
+    assert 0.0 < share < 1.0 and np.isfinite(system.contact.energy(start.moved(way, share)))
+    system.contact.begin_step(start.moved(way, 1.0 * MM / through))
+    assert np.isinf(system.contact.energy(start.moved(way, 1.0 * MM / through)))
+
+
+def test_a_body_that_turns_stops_before_its_arc_meets_something():
+    system = touching("rigid on soft")
+    start = system.initial_state()
+    system.contact.begin_step(start)
+    way = system.zero_direction()
+    way.rigid[0, 3:] = (2.0, 0.0, 0.0)
+    share = system.contact.step_limit(start, way)
+    assert 0.0 < share < 0.5
+    assert free_of_intersections(system, start.moved(way, share))
+
+
+def test_parts_that_are_near_at_rest_do_not_feel_each_other():
+    one = box_mesh(SIZE, (2, 2, 1))
+    lifted = one.vertices + (0.0, 0.0, SIZE[2] + GAP)
+    both = {kind: np.concatenate([block, block + one.n_vertices]) for kind, block in one.blocks.items()}
+    scene = Scene()
+    scene.add_soft(Mesh(np.concatenate([one.vertices, lifted]), both), RUBBER)
+    system = System(scene, contact=Ipc())
+    system.contact.begin_step(system.initial_state())
+    assert system.contact.energy(system.initial_state()) == 0.0
+
+
+def stacked() -> Scene:
+    scene = Scene()
+    scene.add_plane()
+    box(scene, (0.0, 0.0, 0.0), name="lower")
+    tilt = rotation_matrix(np.array([0.02, 0.1, 0.3]))
+    scene.add_rigid(thing(BRICK), position=(9.0 * MM, 9.0 * MM, 14.2 * MM), rotation=tilt)
+    return scene
+
+
+def test_the_same_bits_follow_again_and_from_a_checkpoint(tmp_path):
+    class Stopped(Exception):
+        pass
+
+    def stop(system: System, state: State) -> None:
+        if state.time > 0.035:
+            raise Stopped
+
+    whole = [run(stacked(), duration=0.08)[0][-1] for _ in range(2)]
+    kept = {"checkpoint": tmp_path / "run.npz", "checkpoint_every": 0.0}
+    with pytest.raises(Stopped):
+        simulate(stacked(), duration=0.08, time_step=0.01, contact="ipc", watch=stop, **kept)
+    continued = run(stacked(), duration=0.08, **kept)[0][-1]
+    for name in ("positions", "velocities", "rigid_positions", "rigid_rotations", "angular_momenta"):
+        first = getattr(whole[0], name).tobytes()
+        assert first == getattr(whole[1], name).tobytes() == getattr(continued, name).tobytes(), name
+
+
+def test_the_toolkit_is_imported_when_it_is_needed():
+    code = "import sys, finqd.plugins.contact_ipc as c; c.Ipc(); sys.exit('ipctk' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -104,23 +104,22 @@ class IpcSurface:
         """Return the pairs of vertices, in order, of all edges and faces of one soft body nearer than ``gap``."""
         ipctk, found = toolkit(), set()
         for number in range(n_soft):
-            faces = self.triangles[self.body[self.triangles[:, 0]] == number].astype(np.int32)
-            if not len(faces):
+            mine = np.flatnonzero(self.body[: self.n_vertices] == number)  # a run of numbers
+            if not len(mine):
                 continue
-            edges = ipctk.edges(np.asfortranarray(faces))
-            mesh = ipctk.CollisionMesh(np.asfortranarray(self._rest), edges, np.asfortranarray(faces))
-            near = ipctk.Candidates()
-            near.build(mesh, np.asfortranarray(self._rest), 0.5 * gap)
-            # few meshes have any, and only then is each candidate worth a look
-            touching = ipctk.NormalCollisions()
-            touching.build(near, mesh, np.asfortranarray(self._rest), gap)
-            if not len(touching):
+            rest = np.asfortranarray(self._rest[mine])
+            own = self.triangles[self.body[self.triangles[:, 0]] == number] - mine[0]
+            faces = np.asfortranarray(own.astype(np.int32))
+            edges = ipctk.edges(faces)
+            mesh, near, touching = ipctk.CollisionMesh(rest, edges, faces), ipctk.Candidates(), ipctk.NormalCollisions()
+            near.build(mesh, rest, 0.5 * gap)
+            touching.build(near, mesh, rest, gap)
+            if not len(touching):  # few meshes have any, and only then is each candidate worth a look
                 continue
             for sides in _sides(near, edges, faces):
-                corners = [self._rest[list(side)].ravel() for side in sides]
                 distance = ipctk.point_triangle_distance if len(sides[0]) == 1 else ipctk.edge_edge_distance
-                if distance(*(p for c in corners for p in c.reshape(-1, 3))) < gap**2:
-                    found |= {(min(a, b), max(a, b)) for a in sides[0] for b in sides[1]}
+                if distance(*rest[[*sides[0], *sides[1]]]) < gap**2:
+                    found |= {(min(a, b), max(a, b)) for a in mine[list(sides[0])] for b in mine[list(sides[1])]}
         return found
 
 

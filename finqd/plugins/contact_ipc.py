@@ -161,7 +161,7 @@ class IpcContact:
         self.friction = None
         places = self.points.at(state)
         self._now = self._situation(state, places, free=known is not None or self._intersecting(state) is None)
-        self._free = [self._now]
+        self._keep(self._now)
         self.start, self._missing = state, None
         self.relag(state, whole=True)
 
