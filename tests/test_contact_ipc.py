@@ -144,13 +144,30 @@ def assert_hessian(system: System, state: State, matrix: np.ndarray) -> None:
         assert np.abs(matrix @ way - turn).max() < 1e-4 * np.abs(turn).max()
 
 
-def test_a_wrong_sign_of_the_rotations_bend_is_noticed(monkeypatch):
+def assert_turns_bend() -> None:
+    """Forces that do not change, on points of a rigid body: all second derivatives are those of the rotation."""
+    system = touching("rigid on soft")
+    state, d, points = system.initial_state(), system.derivatives, system.contact.points
+    forces = np.random.default_rng(7).normal(size=(len(points.soft), 3)) * (points.soft < 0)[:, None]
+    d.clear_hessian()
+    points.add_curvature(state, forces, d)
+    assert np.abs(d.rigid_matrix).max() > 1e-3
+    for seed in range(3):
+        turn = Direction(soft=np.zeros((system.n_vertices, 3)), rigid=np.random.default_rng(seed).normal(size=(1, 6)))
+        energies = [float(np.vdot(forces, points.at(state.moved(turn, h)))) for h in (1e-3, 0.0, -1e-3)]
+        bend = (energies[0] - 2.0 * energies[1] + energies[2]) / 1e-6
+        assert turn.rigid[0] @ d.rigid_matrix @ turn.rigid[0] == pytest.approx(bend, rel=1e-4)
+
+
+def test_turns_bend():
+    assert_turns_bend()
+
+
+def test_a_wrong_sign_of_the_turns_bend_is_noticed(monkeypatch):
     right = Points.add_curvature
     monkeypatch.setattr(Points, "add_curvature", lambda self, state, gradient, d: right(self, state, -gradient, d))
-    system = touching("rigid on soft")
-    state = slipping(system)
     with pytest.raises(AssertionError):
-        assert_hessian(system, state, hessian(system, state))
+        assert_turns_bend()
 
 
 def test_planes_have_the_barrier_of_the_toolkit():
