@@ -156,11 +156,12 @@ class IpcContact:
     def begin_step(self, state: State) -> None:
         """Start from ``state`` with the friction bounds of its contacts; nothing depends on earlier steps."""
         known = self._known(state)
+        free = known is not None and bool(np.isfinite(known.energy))
         self.motion.forget()
         self._free, self._now = [], None
         self.friction = None
         places = self.points.at(state)
-        self._now = self._situation(state, places, free=known is not None or self._intersecting(state) is None)
+        self._now = self._situation(state, places, free=free or self._intersecting(state) is None)
         self._keep(self._now)
         self.start, self._missing = state, None
         self.relag(state, whole=True)
