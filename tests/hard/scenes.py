@@ -11,7 +11,7 @@ from finqd.mesh_shapes import box_mesh
 from finqd.objects import GraspObject, load_object
 from finqd.scene import Scene, SoftBody
 
-CONTACTS = ("penalty",)
+CONTACTS = ("penalty", "ipc")
 STEPPERS = ("implicit_euler", "bdf2")
 
 
