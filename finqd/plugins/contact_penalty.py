@@ -50,6 +50,7 @@ class Penalty:
     soft_contact: whether soft bodies touch each other and themselves
     soft_gap_mm: distance at which their faces begin to push each other apart, at most a tenth of the faces' size: a
         barrier keeps points on them from ever passing through
+    soft_stiffness_N_mm3: scale of that barrier; at half the gap it presses with 0.6 of it times the gap
     """
 
     stiffness_N_mm3: Annotated[float, Gt(0), Le(1e6)] = 300.0
@@ -61,6 +62,7 @@ class Penalty:
     weight_penetration_mm: Annotated[float, Gt(0), Le(1)] = 0.01
     soft_contact: bool = True
     soft_gap_mm: Annotated[float, Gt(0), Le(10)] = 0.1
+    soft_stiffness_N_mm3: Annotated[float, Gt(0), Le(1e6)] = 10.0
 
     @property
     def effects(self) -> dict[str, str]:
@@ -125,7 +127,8 @@ class PenaltyContact:
         spacing = options.sample_spacing_mm * MM
         surface = contact_surface(self.scene.soft_bodies, spacing=spacing, most_cells=SOFT_CELLS, rims=True)
         ratio = options.friction_stiffness_ratio
-        return SoftContact(self.scene, surface, gap=gap, pressure=self.stiffness, ratio=ratio)
+        pressure = options.soft_stiffness_N_mm3 / MM**3
+        return SoftContact(self.scene, surface, gap=gap, pressure=pressure, ratio=ratio)
 
     def _lay_out_keys(self) -> None:
         """Number all possible contacts: ``first_key`` of each pair, and friction by `_coefficients`."""
