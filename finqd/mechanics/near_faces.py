@@ -22,14 +22,41 @@ PIECES = {
 }
 
 
-def face_pieces(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangles of all ``faces`` (n_faces, k): those of face f are first[f] to first[f + 1] (n_faces + 1,)
-    of corners (n, 3), local points.
+@dataclass(frozen=True, kw_only=True)
+class Triangulation:
+    """The triangles of faces: those of face f are first[f] to first[f + 1], of n in all.
+
+    corners: local points of their face, vertices: numbers of these points in the whole surface, edges: numbers of edges
+    from each corner to the next, all of shape (n, 3); valence: triangles round each vertex, -1 where they do not close
     """
-    cut = [PIECES[int(n)] for n in np.sum(faces >= 0, axis=1)]
-    first = np.concatenate([[0], np.cumsum([len(pieces) for pieces in cut])]).astype(np.int64)
-    corners = np.array([corners for pieces in cut for corners in pieces], dtype=np.int64).reshape(-1, 3)
-    return first, corners
+
+    first: np.ndarray
+    corners: np.ndarray
+    vertices: np.ndarray
+    edges: np.ndarray
+    valence: np.ndarray
+
+    @classmethod
+    def of(cls, faces: np.ndarray) -> Triangulation:
+        """Cut up ``faces`` (n_faces, k)."""
+        cut = [PIECES[int(n)] for n in np.sum(faces >= 0, axis=1)]
+        first = np.concatenate([[0], np.cumsum([len(pieces) for pieces in cut])]).astype(np.int64)
+        corners = np.array([corners for pieces in cut for corners in pieces], dtype=np.int64).reshape(-1, 3)
+        owner = np.repeat(np.arange(len(faces)), np.diff(first))
+        inner = np.where(corners == CENTRE, 0, corners)
+        middles = int(faces.max(initial=-1)) + 1 + owner
+        points = np.where(corners == CENTRE, middles[:, None], np.take_along_axis(faces[owner], inner, axis=1))
+        _, vertices = np.unique(points, return_inverse=True)
+        vertices = vertices.reshape(-1, 3)
+        ends = np.sort(np.stack([vertices, np.roll(vertices, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+        _, edges, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+        open_ends = ends[counts[edges.ravel()] != 2]
+        valence = np.bincount(vertices.ravel()) if len(vertices) else np.zeros(0, dtype=np.int64)
+        valence[np.unique(open_ends)] = -1
+        return cls(
+            first=first, corners=corners, vertices=vertices, edges=edges.reshape(-1, 3),
+            valence=valence.astype(np.int64),
+        )
 
 
 @dataclass
@@ -64,7 +91,7 @@ class NearFaces:
 
     def __init__(self, bodies: Sequence[SoftBody], surface: ContactSurface, *, gap: float) -> None:
         self.gap, self.margin = gap, MARGIN * gap
-        self.surface, self.faces, self.pieces = surface, surface.faces, face_pieces(surface.faces)
+        self.surface, self.faces, self.triangles = surface, surface.faces, Triangulation.of(surface.faces)
         self.spans = [(body.first_vertex, body.first_vertex + body.mesh.n_vertices) for body in bodies]
         mine = [np.flatnonzero(surface.face_body == i) for i in range(len(bodies))]
         self.watches = []
@@ -102,7 +129,8 @@ class NearFaces:
                 found, gaps = found[order], gaps[order]
                 if moving:
                     return found, gaps
-                refine_gaps(positions, *self.surface.lattices, *self.pieces, found, gaps, NOTCH * self.gap)
+                triangles = self.triangles.first, self.triangles.corners
+                refine_gaps(positions, *self.surface.lattices, *triangles, found, gaps, NOTCH * self.gap)
                 near = gaps < reach
                 return found[near], gaps[near]
             found, gaps = np.zeros((2 * count, 2), dtype=np.int64), np.zeros(2 * count)

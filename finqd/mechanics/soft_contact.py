@@ -85,7 +85,9 @@ class SoftContact:
         self.surface, self.gap, self.pressure, self.ratio = surface, gap, pressure, ratio
         bodies = scene.soft_bodies
         self.near = NearFaces(bodies, surface, gap=gap)
-        self.pieces, self.corners = self.near.pieces
+        self.triangles = self.near.triangles
+        self.points = np.zeros(0, dtype=np.int64)  # of each sample in touch, the row with the largest force,
+        self.loads = np.zeros(0)  # and the force of all its rows [N]
         self.coefficients = np.array([[scene.friction_between(a.name, b.name) for b in bodies] for a in bodies])
         self.rows = _Rows.empty(64, surface.faces.shape[1])
         self.friction = self._friction(np.zeros(0, dtype=np.int64))
@@ -101,27 +103,41 @@ class SoftContact:
             return
         pairs = self.near.at(positions)
         self._at, self.rows.count = positions, 0
+        self.points, self.loads = np.zeros(0, dtype=np.int64), np.zeros(0)
         if len(pairs):
             both = np.concatenate([pairs, pairs[:, ::-1]])
             both = both[np.lexsort((both[:, 1], both[:, 0]))]
             groups, first = np.unique(both[:, 0], return_index=True)
             self._fill(positions, groups, np.append(first, len(both)), np.ascontiguousarray(both[:, 1]))
+        if self.rows.count:
+            self._gather()
 
     def _fill(self, positions: np.ndarray, groups: np.ndarray, first: np.ndarray, others: np.ndarray) -> None:
         while True:
+            t = self.triangles
             count = kernels.find_rows(
-                positions, *self.surface.arrays, self.pressure, self.pieces, self.corners, groups, first, others,
-                self.gap, *self.rows.arrays,
+                positions, *self.surface.arrays, self.pressure, t.first, t.corners, t.edges, t.vertices, t.valence,
+                groups, first, others, self.gap, *self.rows.arrays,
             )
             if count <= len(self.rows.key):
                 self.rows.count = count
                 return
             self.rows = _Rows.empty(2 * count, self.rows.weight.shape[1])
 
+    def _gather(self) -> None:
+        """Sum up the rows of each sample, which follow each other."""
+        n, forces = self.rows.count, self.forces()
+        first = np.flatnonzero(np.diff(self.rows.key[:n], prepend=-1))
+        order = np.lexsort((-forces, self.rows.key[:n]))
+        self.points = order[first]
+        with np.errstate(invalid="ignore"):  # at no distance forces are infinite, and so is the energy
+            vectors = np.add.reduceat(forces[:, None] * self.rows.normal[:n], first, axis=0)
+        self.loads = np.linalg.norm(vectors, axis=1)
+
     @property
     def keys(self) -> np.ndarray:
-        """Number of the sample of each row."""
-        return self.rows.key[: self.rows.count].copy()
+        """Number of each sample in touch."""
+        return self.rows.key[self.points]
 
     def forces(self) -> np.ndarray:
         """Return the normal force of each row [N]."""
@@ -134,16 +150,17 @@ class SoftContact:
         owner, n = self.surface.face_body, self.rows.count
         return owner[self.rows.face[:n]], owner[self.rows.other[:n]]
 
-    def row_coefficients(self) -> np.ndarray:
-        """Return Coulomb's coefficient of each row."""
-        return self.coefficients[self.bodies()]
+    def bounds(self) -> np.ndarray:
+        """Return mu N of each sample in touch [N]."""
+        one, other = self.bodies()
+        return self.coefficients[one[self.points], other[self.points]] * self.loads
 
     # -- friction ------------------------------------------------------------------------------------------------------
 
     def lag(self, start: State, *, bound: np.ndarray, slips: np.ndarray) -> None:
-        """Take the frictional contacts of this step from the rows: ``bound`` mu N [N] and stored ``slips`` [m]."""
+        """Take the frictional contacts of this step from the samples: ``bound`` mu N [N] and stored ``slips`` [m]."""
         used = np.flatnonzero(bound > 0.0)
-        self.friction = self._friction(used, start.positions, bound[used], slips[used])
+        self.friction = self._friction(self.points[used], start.positions, bound[used], slips[used])
 
     def _friction(
         self, used: np.ndarray, positions: np.ndarray | None = None, bound: np.ndarray | None = None,
@@ -152,12 +169,12 @@ class SoftContact:
         rows, faces = self.rows, self.surface.faces
         face, weight, other = rows.face[used], rows.weight[used], rows.other[used]
         beside, start = np.zeros_like(weight), np.zeros((len(used), 3))
-        all_local_weights(faces, other, self.corners, rows.piece[used], rows.share[used], beside)
+        all_local_weights(faces, other, self.triangles.corners, rows.piece[used], rows.share[used], beside)
         if positions is not None:
             kernels.relative_positions(positions, faces, face, weight, other, beside, len(used), start)
         return _Friction(
             key=rows.key[used], face=face, weight=weight, other=other, beside=beside, normal=rows.normal[used],
-            bound=np.zeros(0) if bound is None else bound, stiffness=0.5 * self.ratio * rows.stiffness[used],
+            bound=np.zeros(0) if bound is None else bound, stiffness=0.5 * self.ratio * np.abs(rows.stiffness[used]),
             start=start, start_slip=np.zeros((0, 3)) if slips is None else slips,
         )
 
@@ -189,8 +206,8 @@ class SoftContact:
         self.find(positions)
         rows, f, faces = self.rows, self.friction, self.surface.faces
         energy = kernels.add_gradient(
-            faces, rows.face, rows.weight, rows.other, self.corners, rows.piece, rows.share, rows.distance, rows.normal,
-            rows.stiffness, rows.count, self.gap, gradient,
+            faces, rows.face, rows.weight, rows.other, self.triangles.corners, rows.piece, rows.share, rows.distance,
+            rows.normal, rows.stiffness, rows.count, self.gap, gradient,
         )
         if len(f.key):
             slips = self.trial_slips(positions)
@@ -207,9 +224,9 @@ class SoftContact:
         if rows.count:
             pair = np.searchsorted(self.coupled, self._pair_keys(rows.face[: rows.count], rows.other[: rows.count]))
             kernels.add_hessian(
-                positions, faces, pair, self._slots, rows.face, rows.weight, rows.other, self.corners, rows.piece,
-                rows.share, rows.distance, rows.normal, rows.stiffness, rows.count, self.gap, derivatives.blocks,
-                not projected,
+                positions, faces, pair, self._slots, rows.face, rows.weight, rows.other, self.triangles.corners,
+                rows.piece, rows.share, rows.distance, rows.normal, rows.stiffness, rows.count, self.gap,
+                derivatives.blocks, not projected,
             )
         if len(f.key):
             pair = np.searchsorted(self.coupled, self._pair_keys(f.face, f.other))
@@ -227,8 +244,8 @@ class SoftContact:
             return limit
         s = self.surface
         return kernels.pairs_step_limit(
-            state.positions, direction.soft, s.faces, s.face_lattice, s.lattice_first, s.lattice_weight, self.pieces,
-            self.corners, pairs, limit,
+            state.positions, direction.soft, s.faces, s.face_lattice, s.lattice_first, s.lattice_weight,
+            self.triangles.first, self.triangles.corners, pairs, limit,
         )
 
     # -- room in the Hessian -------------------------------------------------------------------------------------------

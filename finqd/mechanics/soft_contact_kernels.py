@@ -1,8 +1,10 @@
 """Kernels of contact between soft faces: the distance of sample points of one to the triangles of another.
 
-A *row* is a sample point of the face ``face`` (shape weights ``weight`` (k,)) and the closest point of all other faces
-near it: on ``piece`` of the face ``other``, with barycentric ``share`` (3,). ``distance`` is theirs [m], ``normal`` the
-unit vector from the other face to the sample, ``stiffness`` the sample's [N/m]. A row acts where distance < ``gap``.
+A *row* is a sample point of the face ``face`` (shape weights ``weight`` (k,)) and the closest point of a part
+(triangle, edge or vertex) of another face: on ``piece`` of the face ``other``, with barycentric ``share`` (3,).
+``distance`` is theirs [m], ``normal`` the unit vector from the other face to the sample, ``stiffness`` the sample's
+[N/m], times how often the part counts; that may be less than 0, in a valley. A row acts where distance < ``gap``. A
+sample may have several.
 What faces, local points and pieces are, `finqd.mechanics.proximity_kernels` says.
 
 The Hessian of a pair of faces is written by ``slots`` (2 k, 2 k): of the vertices of the face with the lower id, then
@@ -19,6 +21,7 @@ from finqd.mechanics.proximity_kernels import (
     LOCALS,
     box_distance2,
     closest_on_face,
+    closest_on_triangle,
     faces_gap,
     local_points,
     local_weights,
@@ -49,62 +52,166 @@ def barrier(distance, gap, stiffness):
 @njit(cache=True)
 def find_rows(
     positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
-    pieces, corners, groups, group_first, others, gap, out_key, out_face, out_weight, out_other, out_piece, out_share,
-    out_distance, out_normal, out_stiffness,
+    pieces, corners, piece_edges, piece_vertices, valence, groups, group_first, others, gap, out_key, out_face,
+    out_weight, out_other, out_piece, out_share, out_distance, out_normal, out_stiffness,
 ):
-    """Write the samples of faces ``groups`` that are nearer than ``gap`` to one of their ``others``; return how many.
+    """Write the rows of samples of faces ``groups`` nearer than ``gap`` to any of their ``others``; return how many.
 
     others: faces near groups[g] are others[group_first[g] : group_first[g + 1]]; pieces (n_faces + 1,): of face f,
-    pieces[f] to pieces[f + 1]; pressure: stiffness of an area [N/m^3]. Rows beyond the arrays' end are counted, not
-    written.
+    pieces[f] to pieces[f + 1]; piece_edges, piece_vertices (n, 3) and valence: see `near_faces.Triangulation`;
+    pressure: stiffness of an area [N/m^3]. Rows beyond the arrays' end are counted, not written. What rows a sample
+    has, `_parts` says.
     """
-    count, most = 0, 0
-    for f in groups:
-        most = max(most, lattice_first[face_lattice[f] + 1] - lattice_first[face_lattice[f]])
-    points, local, share = np.empty((most, 3)), np.empty((LOCALS, 3)), np.empty(3)
-    nearest2, where = np.empty(most), np.empty((most, 3))
-    who, piece = np.empty(most, np.int64), np.empty(most, np.int64)
-    low, high = np.empty(3), np.empty(3)
+    count = 0
+    x, local = np.empty(3), np.empty((LOCALS, 3))
     for g in range(groups.shape[0]):
-        f = groups[g]
-        first, end, placed = lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1], False
+        f, near = groups[g], 0
+        ids = np.empty(group_first[g + 1] - group_first[g], np.int64)
         for o in range(group_first[g], group_first[g + 1]):
-            other = others[o]
-            if faces_gap(positions, faces[f], faces[other], gap) >= gap:
-                continue
-            if not placed:
-                placed = True
-                for s in range(end - first):
-                    face_point(positions, faces[f], lattice_weight[first + s], points[s])
-                    nearest2[s], who[s] = gap * gap, -1
-            local_points(positions, faces[other], local)
-            face_box(positions, faces[other], low, high)
-            for s in range(end - first):
-                if box_distance2(points[s], low, high) >= nearest2[s]:
-                    continue
-                d2, found = closest_on_face(
-                    points[s], local, corners, pieces[other], pieces[other + 1], nearest2[s], share
-                )
-                if found >= 0:
-                    nearest2[s], who[s], piece[s] = d2, other, found
-                    where[s] = share
-        if not placed:
+            if faces_gap(positions, faces[f], faces[others[o]], gap) < gap:
+                ids[near] = others[o]
+                near += 1
+        if near == 0:
             continue
-        for s in range(end - first):
-            if who[s] < 0:
+        points, boxes, most = np.empty((near, LOCALS, 3)), np.empty((near, 2, 3)), 0
+        for o in range(near):
+            local_points(positions, faces[ids[o]], points[o])
+            face_box(positions, faces[ids[o]], boxes[o, 0], boxes[o, 1])
+            most += pieces[ids[o] + 1] - pieces[ids[o]]
+        who, piece, share = np.empty(5 * most, np.int64), np.empty(5 * most, np.int64), np.empty((5 * most, 3))
+        part, times = np.empty(5 * most, np.int64), np.empty(5 * most, np.int64)
+        first, end = lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1]
+        for s in range(first, end):
+            face_point(positions, faces[f], lattice_weight[s], x)
+            found = _triangles_near(x, ids, near, points, boxes, pieces, corners, gap, who, piece, share)
+            if found == 0:
                 continue
-            if count < out_key.shape[0]:
-                out_key[count] = first_sample[f] + s
-                out_face[count], out_weight[count] = f, lattice_weight[first + s]
-                out_other[count], out_piece[count], out_share[count] = who[s], piece[s], where[s]
-                out_stiffness[count] = pressure * face_area[f] * lattice_share[first + s]
-                _difference(positions, faces, points[s], who[s], corners[piece[s]], where[s], local, out_normal[count])
-                size = math.sqrt(out_normal[count, 0] ** 2 + out_normal[count, 1] ** 2 + out_normal[count, 2] ** 2)
-                out_distance[count] = size
-                if size > 0.0:
-                    out_normal[count] /= size
-            count += 1
+            parts = _parts(
+                x, points, corners, piece_edges, piece_vertices, valence, gap, found, who, piece, share, part, times
+            )
+            for p in range(parts):
+                if times[p] == 0:
+                    continue
+                if count < out_key.shape[0]:
+                    other = ids[who[p]]
+                    out_key[count] = first_sample[f] + s - first
+                    out_face[count], out_weight[count] = f, lattice_weight[s]
+                    out_other[count], out_piece[count], out_share[count] = other, piece[p], share[p]
+                    out_stiffness[count] = times[p] * pressure * face_area[f] * lattice_share[s]
+                    _difference(positions, faces, x, other, corners[piece[p]], share[p], local, out_normal[count])
+                    size = math.sqrt(_dot(out_normal[count], out_normal[count]))
+                    out_distance[count] = size
+                    if size > 0.0:
+                        out_normal[count] /= size
+                count += 1
     return count
+
+
+@njit(cache=True)
+def _triangles_near(x, ids, near, points, boxes, pieces, corners, gap, who, piece, share):
+    """Write the triangles nearer than ``gap`` to x (3,), with the closest point's share; return how many."""
+    found, one = 0, np.empty(3)
+    for o in range(near):
+        if box_distance2(x, boxes[o, 0], boxes[o, 1]) >= gap * gap:
+            continue
+        for t in range(pieces[ids[o]], pieces[ids[o] + 1]):
+            a, b, c = points[o, corners[t, 0]], points[o, corners[t, 1]], points[o, corners[t, 2]]
+            closest_on_triangle(x, a, b, c, one)
+            if _distance2(x, a, b, c, one) < gap * gap:
+                who[found], piece[found] = o, t
+                share[found] = one
+                found += 1
+    return found
+
+
+@njit(cache=True)
+def _distance2(x, a, b, c, share):
+    d2 = 0.0
+    for i in range(3):
+        d2 += (x[i] - share[0] * a[i] - share[1] * b[i] - share[2] * c[i]) ** 2
+    return d2
+
+
+@njit(cache=True)
+def _parts(
+    x, points, corners, piece_edges, piece_vertices, valence, gap, found, who, piece, share, part, times
+):
+    """Turn the triangles near a sample into parts of the surface, each with how often it counts; return how many.
+
+    The sum of all triangles' energies, less that of the edges between them, plus that of the vertices all round which
+    they lie: one and the same energy wherever the surface is flat, and one without kinks where it is not, as that of
+    the closest triangle alone would have in a valley. Source: Li et al., Convergent incremental potential contact,
+    arXiv 2307.15908 (2023), section 4. Terms with the same closest point are joined: a point above the inside of a
+    triangle has that one term.
+    """
+    many = found
+    for t in range(found):
+        part[t], times[t] = _part_of(share[t], piece[t], piece_edges, piece_vertices), 1
+    one = np.empty(3)
+    for t in range(found):
+        local = points[who[t]]
+        for k in range(3):
+            m = (k + 1) % 3
+            shared, round_corner, earlier = False, 0, False
+            for u in range(found):
+                for n in range(3):
+                    shared = shared or (u > t and piece_edges[piece[u], n] == piece_edges[piece[t], k])
+                    if piece_vertices[piece[u], n] == piece_vertices[piece[t], k]:
+                        round_corner += 1
+                        earlier = earlier or u < t
+            a, b, c = local[corners[piece[t], 0]], local[corners[piece[t], 1]], local[corners[piece[t], 2]]
+            if shared:
+                _closest_on_edge(x, local[corners[piece[t], k]], local[corners[piece[t], m]], k, m, one)
+                if _distance2(x, a, b, c, one) < gap * gap:
+                    who[many], piece[many], times[many] = who[t], piece[t], -1
+                    share[many] = one
+                    part[many] = _part_of(one, piece[t], piece_edges, piece_vertices)
+                    many += 1
+            if not earlier and round_corner == valence[piece_vertices[piece[t], k]]:
+                one[0] = one[1] = one[2] = 0.0
+                one[k] = 1.0
+                if _distance2(x, a, b, c, one) < gap * gap:
+                    who[many], piece[many], times[many] = who[t], piece[t], 1
+                    share[many] = one
+                    part[many] = _part_of(one, piece[t], piece_edges, piece_vertices)
+                    many += 1
+    for p in range(many):
+        for q in range(p):
+            if part[q] == part[p]:
+                times[q] += times[p]
+                times[p] = 0
+                break
+    return many
+
+
+@njit(cache=True)
+def _part_of(share, piece, piece_edges, piece_vertices):
+    """Return a number of the triangle, edge or vertex that the point ``share`` (3,) of a piece lies inside of."""
+    zeros, which = 0, 0
+    for i in range(3):
+        if share[i] == 0.0:
+            zeros += 1
+    if zeros == 0:
+        return 3 * piece
+    for i in range(3):
+        if zeros == 1 and share[i] == 0.0:
+            return 3 * piece_edges[piece, (i + 1) % 3] + 1
+        if zeros == 2 and share[i] != 0.0:
+            which = i
+    return 3 * piece_vertices[piece, which] + 2
+
+
+@njit(cache=True)
+def _closest_on_edge(x, a, b, k, m, share):
+    """Write the share (3,), of corners k and m alone, of the point of the edge ab closest to x; exact at its ends."""
+    along, length2 = 0.0, 0.0
+    for i in range(3):
+        along += (x[i] - a[i]) * (b[i] - a[i])
+        length2 += (b[i] - a[i]) ** 2
+    s = min(max(along / length2, 0.0), 1.0)
+    share[0] = share[1] = share[2] = 0.0
+    share[m] = s
+    share[k] = 1.0 - s
 
 
 @njit(cache=True)
@@ -224,6 +331,8 @@ def add_hessian(
     beside, one = np.empty(k), np.empty(3)
     for c in range(count):
         _, slope, second = barrier(distance[c], gap, stiffness[c])
+        if not exact and second < 0.0:
+            continue
         if exact:
             face_point(positions, faces[face[c]], weight[c], point)
             local_points(positions, faces[other[c]], local)

@@ -192,7 +192,7 @@ class PenaltyContact:
         if self.soft is not None:
             self.soft.find(state.positions)
             keys = np.concatenate([keys, self.soft.keys + self.first_key["soft", 0]])
-            wanted = np.concatenate([wanted, self.soft.row_coefficients() * self.soft.forces()])
+            wanted = np.concatenate([wanted, self.soft.bounds()])
         change = self.bounds.renew(keys, wanted, whole=whole)
         self.relagged_forces = self._forces_by_body(force, all_of_them=True)
         bound, slips = self.bounds.values.at(keys), self.slips.at(keys)
