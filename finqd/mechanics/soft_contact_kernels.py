@@ -30,6 +30,7 @@ from finqd.mechanics.proximity_kernels import (
 
 CLOSEST = 0.1  # share of a distance that is left at least by a move
 FLAT = 1e-6  # cosine at which a line counts as square to an edge
+LOOKS = 8  # at two faces on their way, before their samples are followed
 MARCH = 200  # steps after which a sample that slides along a face is not followed any farther
 
 
@@ -439,7 +440,7 @@ def pairs_step_limit(
     x, u, low, high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for p in range(pairs.shape[0]):
         way = limit * relative_way(direction, faces[pairs[p, 0]], faces[pairs[p, 1]]) / (1.0 - CLOSEST)
-        if faces_gap(positions, faces[pairs[p, 0]], faces[pairs[p, 1]], way) > way:
+        if _faces_stay_apart(positions, direction, faces[pairs[p, 0]], faces[pairs[p, 1]], limit, way):
             continue
         for side in range(2):
             f, other = pairs[p, side], pairs[p, 1 - side]
@@ -454,6 +455,35 @@ def pairs_step_limit(
                 face_point(direction, faces[f], lattice_weight[s], u)
                 limit = _sample_limit(x, u, local, moves, near, faces[other], corners, first, end, limit)
     return limit
+
+
+@njit(cache=True)
+def _faces_stay_apart(positions, direction, a, b, limit, way):
+    """Tell whether two faces do not meet on a move: as long as a gap is left, they go on by it, a few times.
+
+    way: bound of how far one moves relative to the other, up to ``limit`` and with a margin [m]
+    """
+    if not way > 0.0:
+        return True
+    k = a.shape[0]
+    moved, one, other = np.empty((2 * k, 3)), np.full(k, -1), np.full(k, -1)
+    at = 0.0
+    for _ in range(LOOKS):
+        for v in range(k):
+            for i in range(3):
+                if a[v] >= 0:
+                    one[v] = v
+                    moved[v, i] = positions[a[v], i] + at * direction[a[v], i]
+                if b[v] >= 0:
+                    other[v] = k + v
+                    moved[k + v, i] = positions[b[v], i] + at * direction[b[v], i]
+        gap = faces_gap(moved, one, other, way)
+        if gap <= 0.0:
+            return False
+        at += gap * limit / way
+        if at >= limit:
+            return True
+    return False
 
 
 @njit(cache=True)

@@ -27,7 +27,7 @@ def twisted_bar(turns: float, elasticity: str) -> Scene:
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 @pytest.mark.parametrize("step", STEPS_MS)
-@pytest.mark.parametrize("elasticity", ["corotated", "neo_hookean"])
+@pytest.mark.parametrize("elasticity", ["corotated", pytest.param("neo_hookean", marks=pytest.mark.slow)])
 def test_a_bar_twisted_by_720_degrees_and_let_go(elasticity, step, stepper):
     scene = twisted_bar(2.0, elasticity)
     _, course = sound(scene, duration=0.5, time_step_ms=step, stepper=stepper)
