@@ -31,7 +31,7 @@ SUPPORT_ALLOWANCE = 2.0  # multiples of `weight_penetration_mm` that such a poin
 FITTING = 0.3  # [mm] spacing of samples that fits bodies of up to
 THICK = 60.0 * MM  # this thickness; for thicker ones it grows with them
 PLANE_CELLS = 8  # samples of that spacing along an edge of a face are no more than these if all there is are planes
-SOFT_CELLS = 32  # along an edge of a face that touches other soft faces, at most
+SOFT_CELLS = 10  # along an edge of a face that touches other soft faces, at most: on coarse meshes contact is coarse
 FACE_SHARE = 0.1  # of the size of soft faces that they keep apart from each other at most
 
 
