@@ -21,7 +21,7 @@ LIBRARIES = {
     "networkx": "networkx", "ribs": "ribs", "qdldl": "qdldl", "shapely": "shapely",
     "meshio": "meshio", "pydantic": "pydantic", "typing_extensions": "typing-extensions", "rich": "rich",
     "matplotlib": "matplotlib", "click": "click",
-    "annotated_types": "annotated-types", "threadpoolctl": "threadpoolctl",
+    "annotated_types": "annotated-types", "threadpoolctl": "threadpoolctl", "ipctk": "ipctk",
 }
 
 #: linear solvers: module (or library, without a module) -> (distribution, what it is, how to get it)

@@ -312,12 +312,13 @@ def test_a_soft_block_on_a_soft_slope_slides_by_coulombs_law(tangent: float, sli
     scene.set_friction("base", "block", 0.5)
     found = simulate(scene, duration=0.3, time_step=0.01, record=True)
     assert found.status == "ok", found.reason
-    way = (found.soft_positions[-1] - found.soft_positions[0])[block.first_vertex :].mean(axis=0)[0]
-    free = 0.5 * 9.81 * 0.3**2 * (np.sin(angle) - 0.5 * np.cos(angle))
-    if slides:
-        assert way == pytest.approx(free, rel=0.08)  # implicit Euler is ahead by a step's share, 1 in 30
+    along = found.soft_positions[:, block.first_vertex :, 0].mean(axis=1)
+    if slides:  # after the block has settled through the gap
+        speeds = np.diff(along) / 0.01
+        rate = np.polyfit(0.01 * np.arange(5, len(speeds)), speeds[5:], 1)[0]
+        assert rate == pytest.approx(9.81 * (np.sin(angle) - 0.5 * np.cos(angle)), rel=0.05)
     else:
-        assert abs(way) < 0.02 * MM
+        assert abs(along[-1] - along[0]) < 0.02 * MM
 
 
 def squeezed_clip(**options) -> tuple[Trajectory, Scene]:
