@@ -313,10 +313,12 @@ def test_a_soft_block_on_a_soft_slope_slides_by_coulombs_law(tangent: float, sli
     found = simulate(scene, duration=0.3, time_step=0.01, record=True)
     assert found.status == "ok", found.reason
     along = found.soft_positions[:, block.first_vertex :, 0].mean(axis=1)
-    if slides:  # after the block has settled through the gap
-        speeds = np.diff(along) / 0.01
-        rate = np.polyfit(0.01 * np.arange(5, len(speeds)), speeds[5:], 1)[0]
-        assert rate == pytest.approx(9.81 * (np.sin(angle) - 0.5 * np.cos(angle)), rel=0.05)
+    if slides:
+        # the first step falls through the gap, and a few go over a bump where triangles meet
+        rates = np.diff(along, n=2) / 0.01**2
+        expected = 9.81 * (np.sin(angle) - 0.5 * np.cos(angle))
+        assert np.median(rates) == pytest.approx(expected, rel=0.02)
+        assert np.mean(np.abs(rates - expected) < 0.1 * expected) > 0.7
     else:
         assert abs(along[-1] - along[0]) < 0.02 * MM
 
