@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finqd.errors import InputError
 from finqd.mechanics import soft_contact_kernels as kernels
 from finqd.mechanics.material import Material
 from finqd.mechanics.proximity_kernels import closest_on_triangle, faces_gap
@@ -265,6 +266,16 @@ def test_thin_walls_and_notches_do_not_push_themselves_at_rest() -> None:
     state = system.initial_state()
     system.contact.begin_step(state)
     assert system.contact.energy(state) == 0.0
+
+
+def test_soft_bodies_that_touch_at_the_start_are_refused_by_name() -> None:
+    scene = Scene()
+    pose = np.eye(4)
+    pose[2, 3] = 0.01
+    scene.add_soft(box_mesh((0.01, 0.01, 0.01), (2, 2, 2)), RUBBER, name="lower")
+    scene.add_soft(box_mesh((0.01, 0.01, 0.01), (2, 2, 2)).transformed(pose), RUBBER, name="upper")
+    with pytest.raises(InputError, match="lower and upper: soft bodies must not touch at the start"):
+        simulate(scene, duration=0.01, time_step=0.01)
 
 
 # -- laws --------------------------------------------------------------------------------------------------------------

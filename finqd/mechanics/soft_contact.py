@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from finqd.errors import InputError
 from finqd.mechanics import soft_contact_kernels as kernels
 from finqd.mechanics.contact_force_kernels import friction_energy, return_mapping
 from finqd.mechanics.contact_rows import KeyedValues
@@ -17,6 +18,7 @@ from finqd.mechanics.state import Direction, State
 from finqd.mechanics.system import Derivatives
 from finqd.scene import Scene
 
+NOTHING = 1e-3  # share of the gap that is none
 AHEAD = 1e-3  # [m] faces that are nearer than this to faces in touch get room in the Hessian with them
 
 
@@ -94,6 +96,17 @@ class SoftContact:
         self.coupled = np.zeros(0, dtype=np.int64)  # keys of pairs of faces that have room in the Hessian
         self._slots = np.zeros((0, 0, 0), dtype=np.int32)
         self._at: np.ndarray | None = None
+        self._refuse_touching(scene)
+
+    def _refuse_touching(self, scene: Scene) -> None:
+        """Raise InputError if two soft bodies have no gap between them at the start: the barrier is infinite."""
+        self.find(np.concatenate([body.start_positions for body in scene.soft_bodies]))
+        one, other = self.bodies()
+        none = np.flatnonzero((one != other) & (self.rows.distance[: self.rows.count] < NOTHING * self.gap))
+        if len(none):
+            names = [scene.soft_bodies[owner[none[0]]].name for owner in (one, other)]
+            reason = f"soft bodies must not touch at the start (leave {1e3 * self.gap:.2g} mm)"
+            raise InputError(reason, " and ".join(names))
 
     # -- what touches --------------------------------------------------------------------------------------------------
 
