@@ -1,4 +1,4 @@
-"""Objects to be grasped: rigid bodies with mass, surface, distance and a pose in which they lie on the floor.
+"""Objects to be grasped, rigid or soft: mass, surface, distance and a pose in which they lie on the floor.
 
 An object is named (``"sphere"``: one of the ten that come with finqd), or comes from a JSON file, a mapping, or a
 surface file:
@@ -48,7 +48,9 @@ Angle = Annotated[float, Ge(-360), Le(360)]
 
 @dataclass(frozen=True)
 class GraspObject:
-    """A rigid object. Its body frame has the centre of mass as origin and the axes of its file.
+    """An object, rigid unless it has a ``soft`` part.
+
+    Its body frame has the centre of mass as origin and the axes of its file.
 
     name; mass [kg]; inertia (3, 3) [kg m^2]: about the centre of mass, in the body frame;
     vertices (n, 3) [m], triangles (m, 3): watertight outward surface in the body frame (a tessellation, if curved);

@@ -30,7 +30,7 @@ from finqd.errors import InputError
 from finqd.protocol import GraspProtocol
 
 FORMAT = "finqd trajectory"
-VERSION = 1
+VERSION = 2
 
 #: a rigid body's surface in its body frame: vertices [m], (n, 3), and triangles (m, 3), outward
 Surface = tuple[np.ndarray, np.ndarray]

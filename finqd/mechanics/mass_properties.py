@@ -58,3 +58,12 @@ def ball_moments(radius: float) -> Moments:
     """Return the moments of a ball about the origin."""
     volume = 4.0 / 3.0 * np.pi * radius**3
     return Moments(volume, np.zeros(3), 0.4 * volume * radius**2 * np.eye(3))
+
+
+def thickness(vertices: np.ndarray, triangles: np.ndarray, volume: float) -> float:
+    """Return six volumes over the surface [m]: a ball's diameter, a cube's edge, three radii of a long wire.
+
+    vertices [m] (n, 3), triangles (m, 3): of a watertight surface around ``volume`` [m^3].
+    """
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    return 6.0 * volume / (0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()))

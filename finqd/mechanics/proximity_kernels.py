@@ -18,6 +18,12 @@ LOCALS = 9  # local points of a face at most
 
 
 @njit(cache=True)
+def dot3(u, v):
+    """Return the product of two vectors (3,)."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@njit(cache=True)
 def closest_on_triangle(p, a, b, c, share):
     """Write the barycentric ``share`` (3,) of the point of the triangle abc that is closest to p; exact zeros on rims.
 

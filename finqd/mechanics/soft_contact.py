@@ -14,6 +14,8 @@ from finqd.mechanics.contact_surface import ContactSurface
 from finqd.mechanics.near_faces import NearFaces
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.proximity_kernels import all_local_weights
+from finqd.mechanics.soft_motion_kernels import pairs_step_limit
+from finqd.mechanics.soft_rows_kernels import find_rows
 from finqd.mechanics.state import Direction, State
 from finqd.mechanics.system import Derivatives
 from finqd.scene import Scene
@@ -128,7 +130,7 @@ class SoftContact:
     def _fill(self, positions: np.ndarray, groups: np.ndarray, first: np.ndarray, others: np.ndarray) -> None:
         while True:
             t = self.triangles
-            count = kernels.find_rows(
+            count = find_rows(
                 positions, *self.surface.arrays, self.pressure, t.first, t.corners, t.edges, t.vertices, t.valence,
                 groups, first, others, self.gap, *self.rows.arrays,
             )
@@ -256,7 +258,7 @@ class SoftContact:
         if not len(pairs):
             return limit
         s = self.surface
-        return kernels.pairs_step_limit(
+        return pairs_step_limit(
             state.positions, direction.soft, s.faces, s.face_lattice, s.lattice_first, s.lattice_weight,
             self.triangles.first, self.triangles.corners, pairs, limit,
         )

@@ -10,6 +10,7 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from finqd.errors import InputError
+from finqd.mechanics.contact_rows import FrictionBounds
 from finqd.mechanics.ipc_barrier import HALF_GAP, PlaneBarrier, PlaneContacts
 from finqd.mechanics.ipc_friction import ContactRows, Friction
 from finqd.mechanics.ipc_motion import KEPT, NEAR, Motion
@@ -23,7 +24,6 @@ from finqd.scene import Scene
 from finqd.units import MM
 
 SUPPORT = 5.0  # [N] that one contact of rigid bodies or planes holds at half the gap at least: grasps press on floors
-LEAST_SHARE = 0.4  # of the way to their new values that friction bounds go at least in a renewal
 HALVINGS = 40  # of the way of bodies that turn, until it counts as blocked
 SHORTEST = 1e-12  # share of a direction that is always left: what goes nowhere fails in the line search
 
@@ -130,9 +130,7 @@ class IpcContact:
         self.friction: Friction | None = None
         self.lowest = _NOWHERE  # where balls touched planes when friction was renewed
         self.riders = self.points  # these and after them the lowest ones
-        self.bounds = np.zeros(len(self.points.soft))  # of friction, by the points that take part in it [N]
-        self._missing: np.ndarray | None = None  # what the last renewal of this step found missing in them [N]
-        self._share = 1.0  # of which it took that share
+        self.bounds = FrictionBounds()  # by the points that take part in it
         self._now: _Situation | None = None
         self._free: list[_Situation] = []  # of this step, known to be free, the last one last
         self._refuse_intersections()
@@ -163,7 +161,8 @@ class IpcContact:
         places = self.points.at(state)
         self._now = self._situation(state, places, free=free or self._intersecting(state) is None)
         self._keep(self._now)
-        self.start, self._missing = state, None
+        self.start = state
+        self.bounds.begin()
         self.relag(state, whole=True)
 
     def relag(self, state: State, *, whole: bool = False) -> float:
@@ -176,29 +175,12 @@ class IpcContact:
         rows = self._rows(now)
         bound = self.coefficients[tuple(rows.bodies.T)] * rows.force
         wanted = rows.shares(bound, len(self.points.soft))
-        missing = wanted - self.bounds
-        total = max(float(wanted.sum()), float(self.bounds.sum()))
-        self.bounds = wanted if whole else self.bounds + self._relaxation(missing) * missing
+        everyone = np.arange(len(wanted))
+        change = self.bounds.renew(everyone, wanted, whole=whole)
         self.relagged_forces = self._forces_by_body(rows)
-        taken = np.divide(self.bounds, wanted, out=np.ones_like(wanted), where=wanted > 0.0)
+        taken = np.divide(self.bounds.values.at(everyone), wanted, out=np.ones_like(wanted), where=wanted > 0.0)
         self._renew_friction(state, rows, bound * rows.mean(taken))
-        return float(np.abs(missing).sum()) / total if total > 0.0 else 0.0
-
-    def _relaxation(self, missing: np.ndarray) -> float:
-        """Return which share of what is ``missing`` in the bounds (n_points,) [N] to add: Aitken's, the first time all.
-
-        Full renewals swing about Coulomb's law for ever where friction carries much of the load.
-        Source: Kuettler and Wall, Comput. Mech. 43 (2008) 61, equation 44.
-        """
-        before, self._missing = self._missing, missing
-        if before is None:
-            self._share = 1.0
-        else:
-            turn = missing - before
-            size = float(np.vdot(turn, turn))
-            if size > 0.0:
-                self._share = min(max(-self._share * float(np.vdot(before, turn)) / size, LEAST_SHARE), 1.0)
-        return self._share
+        return change
 
     def energy(self, state: State) -> float:
         """Return contact and friction energy [J], inf where something intersects or may have passed through."""

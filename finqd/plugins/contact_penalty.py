@@ -14,6 +14,7 @@ from finqd.mechanics import contact_force_kernels as forces
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.contact_rows import FrictionBounds, FrictionRows, KeyedValues, Rows
 from finqd.mechanics.contact_surface import ContactSurface, contact_surface
+from finqd.mechanics.mass_properties import thickness
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
 from finqd.mechanics.rounding import rounded_field
@@ -115,7 +116,7 @@ class PenaltyContact:
         spacing = self.options.sample_spacing_mm * MM
         if not shapes:  # planes are met by corners
             return contact_surface(self.scene.soft_bodies, spacing=spacing, most_cells=math.ceil(PLANE_CELLS / share))
-        thinnest = min(thickness(shape) for shape in shapes)
+        thinnest = min(thickness(s.vertices, s.triangles, s.volume) for s in shapes)
         return contact_surface(self.scene.soft_bodies, spacing=spacing * max(1.0, thinnest / THICK))
 
     def _soft_contact(self) -> SoftContact | None:
@@ -384,13 +385,6 @@ class PenaltyContact:
                 state.positions, *samples, plane.point, plane.normal, self.first_key["plane", p], *rows.arrays, count,
             )
         return count
-
-
-def thickness(shape: GraspObject) -> float:
-    """Return six volumes over the surface [m]: a ball's diameter, a cube's edge, three radii of a long wire."""
-    a, b, c = (shape.vertices[shape.triangles[:, i]] for i in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    return 6.0 * shape.volume / area
 
 
 def _pose(state: State, r: int) -> tuple[np.ndarray, np.ndarray]:
