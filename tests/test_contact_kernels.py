@@ -9,7 +9,7 @@ from finqd.mechanics import contact_force_kernels as force_kernels
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.assembly_kernels import add_diagonal, hold, largest_force
 from finqd.mechanics.contact_rows import KeyedValues, Rows
-from finqd.mechanics.contact_surface import closed_lattice, contact_shape, contact_surface, lattice
+from finqd.mechanics.contact_surface import Sight, closed_lattice, contact_shape, contact_surface, lattice
 from finqd.mechanics.distance_kernels import signed_distance
 from finqd.mechanics.elements import face_shape
 from finqd.mechanics.material import Material
@@ -167,10 +167,12 @@ def test_only_samples_inside_a_body_are_found_and_all_of_them() -> None:
     field = rounded_field(brick, 0.5e-3)
     centre, rotation = np.array([0.009, 0.014, 0.0125]), rotation_matrix(np.array([0.3, -0.2, 0.5]))
 
-    def find(room: int) -> tuple[int, Rows]:
+    def find(room: int, sight: Sight | None = None) -> tuple[int, Rows]:
         rows = Rows(room, surface.faces.shape[1])
+        sight = Sight(surface, len(positions)) if sight is None else sight
         count = kernels.find_soft_rigid(
-            positions, *surface.arrays, 1e9, centre, rotation, field, brick.bounding_radius, 0, 7, *rows.arrays, 0
+            positions, *surface.arrays, 1e9, centre, rotation, field, brick.bounding_radius, *sight.arrays, 0, 7,
+            *rows.arrays, 0
         )
         return count, rows
 
@@ -190,6 +192,15 @@ def test_only_samples_inside_a_body_are_found_and_all_of_them() -> None:
     np.testing.assert_allclose(rows.stiffness[:count], 1e9 * surface.face_area[face] / cells, rtol=1e-12)
     few, rows = find(20)  # what there is no room for is counted
     assert few == count and len(rows.key) == 20
+    # what is remembered of the way changes nothing, wherever the body and the faces go
+    generator, sight = np.random.default_rng(9), Sight(surface, len(positions))
+    for _ in range(30):
+        positions += 2e-4 * generator.normal(size=positions.shape)
+        centre, rotation = centre + 1e-3 * generator.normal(size=3), rotation_matrix(0.1 * generator.normal(size=3))
+        (afresh, rows), (again, others) = find(5000), find(5000, sight)
+        assert afresh == again
+        for one, other in zip(rows.arrays, others.arrays, strict=True):
+            np.testing.assert_array_equal(one[:afresh], other[:afresh])
 
 
 def test_soft_step_limit_lets_no_point_pass_the_allowance() -> None:

@@ -18,6 +18,7 @@ from finqd.mechanics.compiled import njit
 from finqd.mechanics.distance_kernels import distance_curvature, signed_distance
 from finqd.mechanics.rotation_kernels import rotation_matrix
 
+CLEAR = 1.0 - 1e-9  # of a distance that counts as free way, for rounding
 MARCH = 20.0  # allowances of a move after which points that slide along a body are not followed any farther
 
 
@@ -45,20 +46,44 @@ def face_box(positions, nodes, low, high):
 
 
 @njit(cache=True)
+def add_travel(positions, faces, centre, rotation, local, travel):
+    """Add to ``travel`` (n_faces,) [m] the most that a vertex of each face has moved against a body since last time.
+
+    local: where the vertices were in the body's frame, (n_vertices, 3) [m]; where they are now is written there. No
+    point of a face moves farther than its vertices do: its weights are shares.
+    """
+    y, moved = np.empty(3), np.empty(positions.shape[0])
+    for v in range(positions.shape[0]):
+        _into_body(positions[v], centre, rotation, y)
+        moved[v] = math.sqrt((y[0] - local[v, 0]) ** 2 + (y[1] - local[v, 1]) ** 2 + (y[2] - local[v, 2]) ** 2)
+        local[v] = y
+    for f in range(faces.shape[0]):
+        most = 0.0
+        for a in range(faces.shape[1]):
+            if faces[f, a] >= 0:
+                most = max(most, moved[faces[f, a]])
+        travel[f] += most
+
+
+@njit(cache=True)
 def find_soft_rigid(
     positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
-    centre, rotation, field, radius, rigid, first_key, out_key, out_face, out_weight, out_gap, out_normal, out_arm,
-    out_stiffness, out_rigid, out_turns, count,
+    centre, rotation, field, radius, local, travel, face_clear, clear, rigid, first_key, out_key, out_face, out_weight,
+    out_gap, out_normal, out_arm, out_stiffness, out_rigid, out_turns, count,
 ):
     """Append the samples of soft faces that lie inside a rigid body; return the new count.
 
     pressure: stiffness of an area [N/m^3]; radius: of the body's bounding ball [m]. Rows beyond the arrays' end are
     counted, not written. The distance is 1-Lipschitz: a sample nearer to the last one looked at than that was to the
-    body is outside.
+    body is outside; and so is one whose face has not travelled as far yet as it was away when it was looked at:
+    local, travel: see `add_travel`; face_clear (n_faces,), clear (n_samples,): what ``travel`` has to reach [m].
     """
+    add_travel(positions, faces, centre, rotation, local, travel)
     x, y, last = np.empty(3), np.empty(3), np.empty(3)
     low, high = np.empty(3), np.empty(3)
     for f in range(faces.shape[0]):
+        if travel[f] < face_clear[f]:
+            continue
         face_box(positions, faces[f], low, high)
         apart, size2 = False, 0.0
         for i in range(3):
@@ -71,21 +96,28 @@ def find_soft_rigid(
         _into_body(x, centre, rotation, y)
         d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
         if d > 0.5 * math.sqrt(size2):
+            face_clear[f] = travel[f] + CLEAR * (d - 0.5 * math.sqrt(size2))
             continue
         last[:] = x
         first, end = lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1]
         stiffness = pressure * face_area[f]
         for s in range(first, end):
+            sample = first_sample[f] + s - first
+            if travel[f] < clear[sample]:
+                continue
             face_point(positions, faces[f], lattice_weight[s], x)
-            if d > 0.0 and (x[0] - last[0]) ** 2 + (x[1] - last[1]) ** 2 + (x[2] - last[2]) ** 2 < d * d:
+            apart2 = (x[0] - last[0]) ** 2 + (x[1] - last[1]) ** 2 + (x[2] - last[2]) ** 2
+            if d > 0.0 and apart2 < d * d:
+                clear[sample] = travel[f] + CLEAR * (d - math.sqrt(apart2))
                 continue
             last[:] = x
             _into_body(x, centre, rotation, y)
             d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
             if d >= 0.0:
+                clear[sample] = travel[f] + CLEAR * d
                 continue
             if count < out_key.shape[0]:
-                out_key[count] = first_key + first_sample[f] + s - first
+                out_key[count] = first_key + sample
                 out_face[count] = f
                 out_weight[count] = lattice_weight[s]
                 out_gap[count] = d
@@ -213,7 +245,7 @@ def soft_step_limit(
     x, y, low, high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     limit = 1.0
     for f in range(faces.shape[0]):
-        farthest = 0.0
+        farthest, straight = 0.0, 0.0
         for a in range(faces.shape[1]):
             n = faces[f, a]
             if n < 0:
@@ -222,6 +254,8 @@ def soft_step_limit(
             u0 = direction[n, 0] - shift[0] - spin[1] * r2 + spin[2] * r1
             u1 = direction[n, 1] - shift[1] - spin[2] * r0 + spin[0] * r2
             u2 = direction[n, 2] - shift[2] - spin[0] * r1 + spin[1] * r0
+            v0, v1, v2 = direction[n, 0] - shift[0], direction[n, 1] - shift[1], direction[n, 2] - shift[2]
+            straight = max(straight, math.sqrt(v0 * v0 + v1 * v1 + v2 * v2))
             farthest = max(farthest, math.sqrt(u0 * u0 + u1 * u1 + u2 * u2))
         if farthest * limit <= allowance:
             continue
@@ -241,26 +275,30 @@ def soft_step_limit(
         if farthest * limit > free:
             lattice = face_lattice[f]
             weights = lattice_weight[lattice_first[lattice] : lattice_first[lattice + 1]]
+            begin = (free - allowance) / farthest
+            fastest = farthest + math.sqrt(spin[0] ** 2 + spin[1] ** 2 + spin[2] ** 2) * limit * straight
             limit = _way_inside(
                 positions, direction, faces[f], weights, centre, rotation, field, shift, spin, allowance,
-                (free - allowance) / farthest, limit, allowance / farthest,
+                begin, limit, allowance / farthest, fastest,
             )
     return limit
 
 
 @njit(cache=True)
 def _way_inside(
-    positions, direction, nodes, weights, centre, rotation, field, shift, spin, allowance, begin, limit, unit
+    positions, direction, nodes, weights, centre, rotation, field, shift, spin, allowance, begin, limit, unit, fastest
 ):
     """Return the share (up to ``limit``) of a move up to which no sample of a face goes ``allowance`` [m] deep.
 
     Counted is the way along the normal that a sample goes inside the body, inwards and outwards, so that nothing goes
     right through a thin one either. begin: share up to which the face touches nothing; unit: share in which it moves
-    by the allowance. At least one unit is granted, at most `MARCH` of them; there are two looks in each.
+    by the allowance. At least one unit is granted, at most `MARCH` of them; there are two looks in each, at samples
+    that can have come to the body since they were looked at last; fastest: how far a share of 1 takes them [m].
     """
     stride, least, limit = 0.5 * unit, begin + unit, min(limit, begin + MARCH * unit)
     x, y, u, way = np.empty(3), np.empty(3), np.empty(3), np.zeros(weights.shape[0])
     c, w, last = np.empty(3), np.empty(3), np.zeros(3)  # last: read before it is first set
+    clear = np.zeros(weights.shape[0])  # share up to which a sample is outside
     share = begin + 0.5 * stride
     while share < limit:
         turned = rotation_matrix(share * spin) @ rotation
@@ -268,6 +306,8 @@ def _way_inside(
             c[i] = centre[i] + share * shift[i]
         d = 0.0
         for s in range(weights.shape[0]):
+            if share < clear[s]:
+                continue
             face_point(positions, nodes, weights[s], x)
             face_point(direction, nodes, weights[s], u)
             apart2 = 0.0
@@ -275,12 +315,14 @@ def _way_inside(
                 x[i] += share * u[i]
                 apart2 += (x[i] - last[i]) ** 2
             if d > 0.0 and apart2 < d * d:  # the distance is 1-Lipschitz: outside as well
+                clear[s] = share + CLEAR * (d - math.sqrt(apart2)) / fastest
                 continue
             for i in range(3):
                 last[i] = x[i]
             _into_body(x, c, turned, y)
             d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
             if d >= 0.0:
+                clear[s] = share + CLEAR * d / fastest
                 continue
             for i in range(3):
                 w[i] = x[i] - c[i]

@@ -52,6 +52,23 @@ class ContactSurface:
         return self.faces, self.face_lattice, self.lattice_first, self.lattice_weight
 
 
+class Sight:
+    """How far the samples of a surface are from a rigid body at least, so that few have to be looked at again.
+
+    It saves time and changes no result. Arrays as `finqd.mechanics.contact_kernels.find_soft_rigid` takes them.
+    """
+
+    def __init__(self, surface: ContactSurface, n_vertices: int) -> None:
+        self.local = np.zeros((n_vertices, 3))
+        self.travel, self.face_clear = np.zeros(len(surface.faces)), np.full(len(surface.faces), -1.0)
+        self.clear = np.full(surface.n_samples, -1.0)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What kernels take, in their order."""
+        return self.local, self.travel, self.face_clear, self.clear
+
+
 def lattice(face_type: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     """Return local points (p, 2) in the middles of n by m equal cells (n by n for a triangle), and their equal shares.
 

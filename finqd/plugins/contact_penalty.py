@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from finqd.mechanics import contact_force_kernels as forces
 from finqd.mechanics import contact_kernels as kernels
 from finqd.mechanics.contact_rows import FrictionBounds, FrictionRows, KeyedValues, Rows
-from finqd.mechanics.contact_surface import ContactSurface, contact_surface
+from finqd.mechanics.contact_surface import ContactSurface, Sight, contact_surface
 from finqd.mechanics.mass_properties import thickness
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
@@ -97,6 +97,8 @@ class PenaltyContact:
         self.support_stiffness = [
             max(s.mass * weight / (options.weight_penetration_mm * MM), self.stiffness * SUPPORT_AREA) for s in shapes
         ]
+        n_vertices = sum(body.mesh.n_vertices for body in scene.soft_bodies)
+        self.sights = [Sight(self.surface, n_vertices) for _ in shapes]
         self.soft = self._soft_contact()
         self._lay_out_keys()
         self.rows = Rows(256, self.surface.faces.shape[1])
@@ -372,8 +374,8 @@ class PenaltyContact:
         for r, body in enumerate(scene.rigid_bodies):
             pose = _pose(state, r)
             count = kernels.find_soft_rigid(
-                state.positions, *samples, *pose, self.fields[r], float(body.shape.bounding_radius), r,
-                self.first_key["rigid", r], *rows.arrays, count,
+                state.positions, *samples, *pose, self.fields[r], float(body.shape.bounding_radius),
+                *self.sights[r].arrays, r, self.first_key["rigid", r], *rows.arrays, count,
             )
             for p, plane in enumerate(scene.planes):
                 count = kernels.find_rigid_plane(

@@ -10,6 +10,7 @@ import numpy as np
 from finqd.errors import InputError
 from finqd.mechanics import corotated_kernels as kernels
 from finqd.mechanics.element_stiffness import kinds_of, rest_elements
+from finqd.mechanics.hourglass import FoldingLimit, folding_limit
 
 if TYPE_CHECKING:
     from finqd.mechanics.material import Material
@@ -44,12 +45,18 @@ class RestBlock:
     kinds: np.ndarray
     stiffness: np.ndarray
     nodes: np.ndarray
+    limit: FoldingLimit | None
     cache: dict[str, np.ndarray] = field(default_factory=dict, repr=False)  # shared by shifted copies
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
         """What all kernels take first."""
         return self.nodes, self.rest, self.gradients, self.kinds, self.stiffness
+
+    def shifted(self, first_vertex: int) -> RestBlock:
+        """Return the same with vertex ids raised by ``first_vertex``."""
+        limit = None if self.limit is None else self.limit.shifted(first_vertex)
+        return replace(self, nodes=self.nodes + first_vertex, limit=limit)
 
     @property
     def compliance(self) -> np.ndarray:
@@ -75,17 +82,20 @@ class CorotatedPotential:
 
     def shifted(self, first_vertex: int) -> CorotatedPotential:
         """Return the same body with its vertex ids raised by ``first_vertex``; rest data is shared, not copied."""
-        return CorotatedPotential(tuple(replace(block, nodes=block.nodes + first_vertex) for block in self.blocks))
+        return CorotatedPotential(tuple(block.shifted(first_vertex) for block in self.blocks))
 
     def energy(self, positions: np.ndarray) -> float:
         """Return the elastic energy [J] at ``positions`` (n_vertices, 3) [m]."""
-        return sum((kernels.energy(*b.arrays, positions) for b in self.blocks), 0.0)
+        total = sum((kernels.energy(*b.arrays, positions) for b in self.blocks), 0.0)
+        return total + sum((b.limit.energy(positions) for b in self.blocks if b.limit is not None), 0.0)
 
     def add_gradient(self, positions: np.ndarray, gradient: np.ndarray) -> float:
         """Add dE/dpositions [N] to ``gradient`` (n_vertices, 3); return the energy [J]."""
         total = 0.0
         for b in self.blocks:
             total += kernels.add_gradient(*b.arrays, positions, gradient)
+            if b.limit is not None:
+                total += b.limit.add_gradient(positions, gradient)
         return total
 
     def add_hessian(
@@ -99,6 +109,8 @@ class CorotatedPotential:
         for b, slot in zip(self.blocks, slots, strict=True):
             compliance = b.compliance if projected else _NONE
             kernels.add_hessian(*b.arrays, compliance, positions, slot, blocks, projected)
+            if b.limit is not None:
+                b.limit.add_hessian(positions, slot, blocks)
 
 
 def _rest_block(name: str, nodes: np.ndarray, vertices: np.ndarray, lame: tuple[float, float]) -> RestBlock:
@@ -108,6 +120,7 @@ def _rest_block(name: str, nodes: np.ndarray, vertices: np.ndarray, lame: tuple[
     return RestBlock(
         rest=np.ascontiguousarray(rest), gradients=np.ascontiguousarray(elements.gradients), kinds=kinds,
         stiffness=np.ascontiguousarray(elements.stiffness[first]), nodes=nodes,
+        limit=folding_limit(name, nodes, vertices, lame[1]),
     )
 
 

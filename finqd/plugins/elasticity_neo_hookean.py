@@ -17,6 +17,7 @@ from finqd.mechanics.element_stiffness import (
     mode_gradients,
 )
 from finqd.mechanics.elements import Element, element
+from finqd.mechanics.hourglass import FoldingLimit, folding_limit
 
 if TYPE_CHECKING:
     from finqd.mechanics.material import Material
@@ -62,6 +63,12 @@ class RestBlock:
     group: np.ndarray
     start: np.ndarray
     hourglass: np.ndarray
+    limit: FoldingLimit | None
+
+    def shifted(self, first_vertex: int) -> RestBlock:
+        """Return the same with vertex ids raised by ``first_vertex``."""
+        limit = None if self.limit is None else self.limit.shifted(first_vertex)
+        return replace(self, nodes=self.nodes + first_vertex, limit=limit)
 
 
 _NONE = np.zeros((0, 3))
@@ -86,7 +93,7 @@ class NeoHookeanPotential:
 
     def shifted(self, first_vertex: int) -> NeoHookeanPotential:
         """Return the same body with its vertex ids raised by ``first_vertex``; rest data is shared, not copied."""
-        blocks = tuple(replace(block, nodes=block.nodes + first_vertex) for block in self.blocks)
+        blocks = tuple(block.shifted(first_vertex) for block in self.blocks)
         return NeoHookeanPotential(blocks, self.mu, self.kappa)
 
     def _modes(self, positions: np.ndarray) -> tuple[bool, list[np.ndarray]]:
@@ -114,6 +121,8 @@ class NeoHookeanPotential:
         total = 0.0
         for b, alpha in zip(self.blocks, modes, strict=True):
             total += kernels.add_gradient(*self._arguments(b), positions, alpha, known, gradient)
+            if b.limit is not None:
+                total += b.limit.add_gradient(positions, gradient)
         if not known and np.isfinite(total):
             self.memory["positions"] = positions.copy()
         return total
@@ -128,6 +137,8 @@ class NeoHookeanPotential:
         known, modes = self._modes(positions)
         for b, alpha, slot in zip(self.blocks, modes, slots, strict=True):
             kernels.add_hessian(*self._arguments(b), positions, alpha, known, slot, blocks, projected)
+            if b.limit is not None:
+                b.limit.add_hessian(positions, slot, blocks)
 
 
 def _rest_block(name: str, nodes: np.ndarray, vertices: np.ndarray, lame: tuple[float, float]) -> RestBlock:
@@ -139,7 +150,10 @@ def _rest_block(name: str, nodes: np.ndarray, vertices: np.ndarray, lame: tuple[
     group = np.arange(len(kind.points))
     if name == "wedge6":
         group %= 2  # one dilatation a level; `wedge_rule`: levels run fastest
-    return RestBlock(nodes=nodes, shapes=shapes, weights=weights, group=group, start=start, hourglass=hourglass)
+    limit = folding_limit(name, nodes, vertices, lame[1])
+    return RestBlock(
+        nodes=nodes, shapes=shapes, weights=weights, group=group, start=start, hourglass=hourglass, limit=limit
+    )
 
 
 def _rest_chunk(kind: Element, points: np.ndarray, lame: tuple[float, float], first: int) -> tuple[np.ndarray, ...]:
