@@ -17,6 +17,7 @@ from finqd.mesh_reference import MID_EDGES
 
 REENTRANT = np.radians(200.0)  # interior angle between two boundary faces from which their edge counts as a notch
 QUARTER = 0.25
+SOUND = 0.02  # smallest over largest Jacobian of an element, below which its nodes stay in the middle; usual are 0.05
 
 
 def notch_vertices(mesh: Mesh, *, angle: float = REENTRANT) -> np.ndarray:
@@ -35,7 +36,8 @@ def with_quarter_nodes(mesh: Mesh) -> Mesh:
     """Return a mesh of straight quadratic elements with the mid-edge nodes next to a notch at a quarter of their edge.
 
     An edge that ends in notches at both sides keeps its node in the middle, as one between two vertices of the same
-    notch must. Volume and boundary stay as they are. Sets are not carried over.
+    notch must, and so do all edges of an element that would be turned inside out, or nearly (a skew one, or one with
+    notches at two of its sides). Volume and boundary stay as they are. Sets are not carried over.
     """
     notch = notch_vertices(mesh)
     vertices = mesh.vertices.copy()
@@ -46,4 +48,29 @@ def with_quarter_nodes(mesh: Mesh) -> Mesh:
             moved = notch[tip] & ~notch[far]
             start, end = mesh.vertices[tip[moved]], mesh.vertices[far[moved]]
             vertices[middle[moved]] = start + QUARTER * (end - start)
-    return Mesh(vertices, mesh.blocks)
+    while True:  # ends at the latest where all nodes are back in the middle
+        spoiled = [middle_nodes(mesh, kind)[jacobian_ratios(kind, vertices[nodes]) < SOUND]
+                   for kind, nodes in mesh.blocks.items()]
+        back = np.unique(np.concatenate([ids.ravel() for ids in spoiled]))
+        if np.array_equal(vertices[back], mesh.vertices[back]):
+            return Mesh(vertices, mesh.blocks)
+        vertices[back] = mesh.vertices[back]
+
+
+def middle_nodes(mesh: Mesh, kind: str) -> np.ndarray:
+    """Return the mid-edge nodes of the quadratic elements of a block, (n, edges)."""
+    return mesh.blocks[kind][:, -len(MID_EDGES[kind]) :]
+
+
+def jacobian_ratios(kind: str, points: np.ndarray) -> np.ndarray:
+    """Return the smallest over the largest Jacobian of each element (n,), at the points of both its quadratures.
+
+    ``points``: its nodes (n, k, 3) [m]; those of the stiffness, and those that are exact
+    """
+    from finqd.mechanics.element_stiffness import exact_rule
+    from finqd.mechanics.elements import element
+
+    shape = element(kind)
+    both = np.concatenate([shape.points, exact_rule(shape)[0]])
+    found = np.linalg.det(np.einsum("nai,qaj->nqij", points, shape.shape_gradients(both)))
+    return found.min(axis=1) / found.max(axis=1)

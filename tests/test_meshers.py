@@ -18,7 +18,7 @@ from finqd import registry
 from finqd.errors import InputError, MeshError, PluginError
 from finqd.mechanics.mass import lumped_masses
 from finqd.mesh import Mesh
-from finqd.mesh_notches import notch_vertices
+from finqd.mesh_notches import jacobian_ratios, notch_vertices
 from finqd.mesh_reference import MID_EDGES
 from finqd.mesh_shapes import box_mesh
 from finqd.meshing import close_mesher, mesh_solid
@@ -224,6 +224,21 @@ def test_quarter_nodes_stand_at_the_notches_and_nowhere_else() -> None:
     assert {name: len(ids) for name, ids in quarter.node_sets.items()} == {
         name: len(ids) for name, ids in middle.node_sets.items()
     }
+
+
+def test_elements_too_skew_for_quarter_nodes_keep_them_in_the_middle() -> None:
+    """Ten thin ribs that lean by 40 degrees: with all nodes moved, an element is turned inside out."""
+    solid = FinRay().build({**BENCHMARK, "rib_count": 10, "rib_thickness": 1e-3, "rib_angle": np.radians(40.0)})
+    options = {"size_mm": 4.0, "order": 2, "layers": 1}
+    middle, quarter = Swept(**options).mesh(solid), Swept(**options, notch_nodes="quarter").mesh(solid)
+    points = quarter.vertices[quarter.blocks["hex20"]]
+    assert jacobian_ratios("hex20", points).min() >= 0.02
+    moved = np.linalg.norm(quarter.vertices - middle.vertices, axis=1) > 1e-12
+    assert 100 < moved.sum()
+    sides, notch = np.array(MID_EDGES["hex20"]), notch_vertices(middle)
+    ends = middle.blocks["hex20"][:, sides]
+    kept = middle.blocks["hex20"][:, 8:][(notch[ends[..., 0]] != notch[ends[..., 1]])]
+    assert 0 < np.sum(~moved[np.unique(kept)]) < 30
     with pytest.raises(PluginError, match="notch_nodes"):
         registry.create("mesher", {"name": "swept", "notch_nodes": "third"})
 

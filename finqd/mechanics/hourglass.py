@@ -12,6 +12,7 @@ from finqd.mechanics.elements import element
 
 CALM = 0.01  # g0 [-]: grasps of smooth objects stay below it; from 0.06 on, elements fold
 HARDENING = 40.0  # c [-]: at g = 0.06 the stress is about the shear modulus; that early also takes the fewest iterations
+STEEP = 0.2  # d1 [-]: no element that is not tangled comes as far
 
 _NONE = np.zeros((0, 3))
 
@@ -31,7 +32,7 @@ class FoldingLimit:
 
     @property
     def _arguments(self) -> tuple:
-        return self.nodes, self.kinds, self.laplacians, self.volumes, self.stiffness, CALM
+        return self.nodes, self.kinds, self.laplacians, self.volumes, self.stiffness, CALM, STEEP
 
     def shifted(self, first_vertex: int) -> FoldingLimit:
         """Return the same with vertex ids raised by ``first_vertex``."""

@@ -3,16 +3,17 @@
 With L = (L_full - L_reduced)+ (see `finqd.mechanics.element_stiffness.hourglass_matrix`), the mean square of the
 gradient that only the full rule sees is
 
-    g = 1/V sum_ab L_ab x_a . x_b                                   [-], 0 for any affine motion
-    E = c mu V / 2 (g - g0)+^2                                      [J]
-    gradient_a = s (L x)_a,  s = 2 c mu (g - g0)+                   [N]
-    Hessian_ab = s L_ab 1 + 4 c mu / V (L x)_a (L x)_b^T  if g > g0 [N/m], positive semidefinite
+    g = 1/V sum_ab L_ab x_a . x_b                        [-], 0 for any affine motion
+    E = c mu V h(g - g0)                                 [J]     h(d) = d^2/2, and from d = d1 on d1 d - d1^2/2
+    gradient_a = 2 c mu h' (L x)_a                       [N]
+    Hessian_ab = 2 c mu h' L_ab 1 + 4 c mu h''/V (L x)_a (L x)_b^T   [N/m], positive semidefinite
 
-Where no element is folded far (g <= g0) this is zero. A hardening of the hourglass stiffness; the idea of an artificial
+Where no element is folded far (g <= g0) this is zero, and far beyond it is quadratic in the positions: bodies that
+start tangled are no harder than others. A hardening of the hourglass stiffness; the idea of an artificial
 stiffness is that of Flanagan and Belytschko, Int. J. Numer. Methods Eng. 17 (1981) 679; the law is our own.
 
 Arrays of a block: nodes (n, k) scene vertex ids; kinds (n,): shape of each element; laplacians L (n_kinds, k, k) [m];
-volumes V (n_kinds,) [m^3]; positions (n_vertices, 3) [m]; stiffness c mu [Pa]; calm g0 [-].
+volumes V (n_kinds,) [m^3]; positions (n_vertices, 3) [m]; stiffness c mu [Pa]; calm g0, steep d1 [-].
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def _folded(e, nodes, laplacian, positions, x, lx):
 
 
 @njit(cache=True)
-def add_gradient(nodes, kinds, laplacians, volumes, stiffness, calm, positions, gradient):
+def add_gradient(nodes, kinds, laplacians, volumes, stiffness, calm, steep, positions, gradient):
     """Add s (L x)_a [N] to gradient (n_vertices, 3), unless that is empty; return the energy [J]."""
     k = nodes.shape[1]
     x, lx = np.empty((3, k)), np.empty((k, 3))
@@ -53,16 +54,17 @@ def add_gradient(nodes, kinds, laplacians, volumes, stiffness, calm, positions, 
         kind = kinds[e]
         over = _folded(e, nodes, laplacians[kind], positions, x, lx) / volumes[kind] - calm
         if over > 0.0:
-            total += 0.5 * stiffness * volumes[kind] * over * over
+            rate = min(over, steep)
+            total += stiffness * volumes[kind] * rate * (over - 0.5 * rate)
             if gradient.shape[0] > 0:
                 for a in range(k):
                     for i in range(3):
-                        gradient[nodes[e, a], i] += 2.0 * stiffness * over * lx[a, i]
+                        gradient[nodes[e, a], i] += 2.0 * stiffness * rate * lx[a, i]
     return total
 
 
 @njit(cache=True)
-def add_hessian(nodes, kinds, laplacians, volumes, stiffness, calm, positions, slots, blocks):
+def add_hessian(nodes, kinds, laplacians, volumes, stiffness, calm, steep, positions, slots, blocks):
     """Add the Hessian [N/m] to blocks (n_blocks + 1, 3, 3); slots (n, k, k)."""
     k = nodes.shape[1]
     x, lx = np.empty((3, k)), np.empty((k, 3))
@@ -70,11 +72,11 @@ def add_hessian(nodes, kinds, laplacians, volumes, stiffness, calm, positions, s
         kind = kinds[e]
         over = _folded(e, nodes, laplacians[kind], positions, x, lx) / volumes[kind] - calm
         if over > 0.0:
-            outer = 4.0 * stiffness / volumes[kind]
+            outer = 4.0 * stiffness / volumes[kind] if over < steep else 0.0
             for a in range(k):
                 for b in range(k):
                     slot = slots[e, a, b]
-                    same = 2.0 * stiffness * over * laplacians[kind, a, b]
+                    same = 2.0 * stiffness * min(over, steep) * laplacians[kind, a, b]
                     for i in range(3):
                         blocks[slot, i, i] += same
                         for j in range(3):

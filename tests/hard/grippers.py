@@ -9,6 +9,8 @@ from finqd.data import designs_folder
 from finqd.design import Design
 from finqd.evaluate import finger_meshes
 from finqd.grasp import GraspTask, grasp_scene
+from finqd.mesh import Mesh
+from finqd.meshing import mesh_solid
 from finqd.objects import load_object
 from finqd.presets import apply_preset
 from finqd.scene import Scene
@@ -39,6 +41,12 @@ def design(**finger: float) -> Design:
     """Return the benchmark design, some parameters of its fingers replaced."""
     given = Design.from_json(designs_folder() / "benchmark.json")
     return given.with_overrides({f"finger.{key}": value for key, value in finger.items()})
+
+
+def finger_mesh(chosen: Design) -> Mesh:
+    """Return the mesh of a design's first finger, in the finger's frame."""
+    solid = chosen.plugin("geometry").build(chosen.finger_si(0))
+    return mesh_solid(chosen.plugin("mesher"), solid)
 
 
 def gripper(what: dict[str, Any] | None, *, given: Design | None = None, **overrides: Any) -> Scene:

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from finqd.mesh_shapes import box_mesh
+from finqd.presets import apply_preset
 from finqd.scene import Scene
+from finqd.simulate import simulate
 
+from .grippers import design, finger_mesh
 from .scenes import STEPPERS, rubber
 from .sound import STEPS_MS, sound
 
@@ -35,3 +38,53 @@ def test_a_bar_twisted_by_720_degrees_and_let_go(elasticity, step, stepper):
     if stepper == "implicit_euler" and step >= 20:  # which damps: it has come to rest
         rest = scene.soft_bodies[0].mesh.vertices
         assert np.abs(course.states[-1].positions - rest).max() < 1e-3
+
+
+TANGLED = {"name": "penalty", "soft_contact": False}  # what starts inside out goes through itself on the way back
+
+
+def scattered(mesh, material, *, scatter: float, elasticity: str = "corotated") -> Scene:
+    """Return a body held at its base whose other nodes start off their places by up to ``scatter`` [m] an axis."""
+    scene = Scene(gravity=(0.0, 0.0, 0.0))
+    body = scene.add_soft(mesh, material, elasticity=elasticity)
+    body.fix("base" if "base" in mesh.node_sets else "zmin")
+    off = np.random.default_rng(1).uniform(-scatter, scatter, mesh.vertices.shape)
+    body.start_positions[:] += np.where(body.fixed, 0.0, off)
+    return scene
+
+
+@pytest.mark.parametrize("step", STEPS_MS)
+@pytest.mark.parametrize("order", [1, 2])
+def test_every_node_of_a_finger_off_by_more_than_a_wall_is_thick(order, step):
+    """Walls are 2 mm thick, so that most elements start inside out; it finds its rest shape again."""
+    chosen = apply_preset(design(), "draft", overrides={"mesher.order": order, "mesher.notch_nodes": "middle"})
+    scene = scattered(finger_mesh(chosen), chosen.material, scatter=3e-3)
+    body = scene.soft_bodies[0]
+    found, course = sound(
+        scene, duration=0.5, time_step_ms=step, contact=TANGLED,
+        stepper={"name": "implicit_euler", "max_iterations": 200},
+    )
+    start = body.mesh.transformed(np.eye(4))
+    start.vertices[:] = body.start_positions
+    assert start.quality().inverted > 0.5 * body.mesh.n_elements
+    assert np.abs(course.states[-1].positions - body.mesh.vertices).max() < (1e-6 if step >= 10 else 1e-3)
+
+
+@pytest.mark.parametrize("step", STEPS_MS)
+def test_every_node_of_a_finger_anywhere(step):
+    """Of so wild a start not every turn is undone: a frame has equilibria that are wound up. But it gets to rest."""
+    chosen = apply_preset(design(), "draft")
+    mesh = finger_mesh(chosen)
+    scene = scattered(mesh, chosen.material, scatter=0.0)
+    body = scene.soft_bodies[0]
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    anywhere = np.random.default_rng(2).uniform(low, high, mesh.vertices.shape)
+    body.start_positions[:] = np.where(body.fixed, mesh.vertices, anywhere)
+    energies = []
+    found = simulate(
+        scene, duration=0.5, time_step=1e-3 * step, contact=TANGLED,
+        stepper={"name": "implicit_euler", "max_iterations": 1000},
+        watch=lambda system, state: energies.append(system.energy(state)),
+    )
+    assert found.status == "ok", found.reason
+    assert np.all(np.isfinite(energies)) and energies[-1] <= energies[0]
