@@ -13,6 +13,9 @@ from finqd.scene import Scene, SoftBody
 
 CONTACTS = ("penalty", "ipc")
 STEPPERS = ("implicit_euler", "bdf2")
+#: slip a step [m] at which a contact model's friction is full: one that calls for the share f of it creeps by
+#: 1 - sqrt(1 - f) of this a step (`finqd.plugins.contact_ipc.Ipc`)
+CREEP = {"penalty": 0.0, "ipc": 1e-6}
 
 
 def rubber(*, youngs_modulus: float = 1e6, poisson_ratio: float = 0.4) -> Material:

@@ -56,7 +56,7 @@ def test_a_finger_folded_back_on_itself(step, contact):
 @pytest.mark.parametrize("contact", CONTACTS)
 @pytest.mark.parametrize("step", STEPS_MS)
 def test_fingers_that_start_a_millimetre_apart(step, contact):
-    """Two of them face to face; one is pushed 10 mm into the other."""
+    """Two of them face to face; one is turned about the near end of its base, by 20 degrees into the other."""
     scene, chosen, mesh = finger_scene()
     into = contact_normal(mesh)
     opposite = np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -72,7 +72,10 @@ def test_fingers_that_start_a_millimetre_apart(step, contact):
     other = other.transformed(shift)
     one = scene.add_soft(mesh, chosen.material, name="one")
     two = scene.add_soft(other, chosen.material, name="two")
-    one.drive("base", Motion(path=Shift(vector=-0.01 * into), duration=0.8))
+    face = mesh.vertices[contact_vertices(mesh)]
+    hinge = face[np.argmin(face[:, 1])] + 2e-3 * into
+    angle = np.radians(20.0) * np.sign(into[0])
+    one.drive("base", Motion(path=Turn(point=hinge, axis=(0.0, 0.0, 1.0), angle=angle), duration=0.8))
     two.fix("base")
     found, course = sound(scene, duration=1.0, time_step_ms=step, contact=contact, driven=True)
     forces = found.contact_forces[-1]
