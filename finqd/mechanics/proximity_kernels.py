@@ -15,6 +15,8 @@ from finqd.mechanics.polar_kernels import closest_rotation
 
 CENTRE = 8  # local number of a quadrilateral's middle
 LOCALS = 9  # local points of a face at most
+PIECES = 8  # triangles of a face at most
+ROUNDED = 1.0 - 1e-9  # of a distance from a plane that counts, for rounding
 
 
 @njit(cache=True)
@@ -100,6 +102,30 @@ def all_local_weights(faces, other, corners, piece, share, weights):
     """Write the `local_weights` (n, k) of n rows with faces ``other`` (n,), ``piece`` (n,) and ``share`` (n, 3)."""
     for c in range(other.shape[0]):
         local_weights(faces[other[c]], corners[piece[c]], share[c], weights[c])
+
+
+@njit(cache=True)
+def piece_planes(points, corners, first, end, planes):
+    """Write the planes of a face's pieces first to end: unit normal and offset, zeros for a flat one, (n, 4).
+
+    A point that is off a piece's plane by a distance is off the piece by as much at least: most are ruled out so.
+    """
+    for piece in range(first, end):
+        a, b, c = points[corners[piece, 0]], points[corners[piece, 1]], points[corners[piece, 2]]
+        u0, u1, u2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        v0, v1, v2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        size = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        size = ROUNDED / size if size > 0.0 else 0.0
+        row = planes[piece - first]
+        row[0], row[1], row[2] = size * n0, size * n1, size * n2
+        row[3] = row[0] * a[0] + row[1] * a[1] + row[2] * a[2]
+
+
+@njit(cache=True)
+def off_plane(plane, x):
+    """Return a lower bound of how far a point is off a piece with this plane [m]."""
+    return abs(plane[0] * x[0] + plane[1] * x[1] + plane[2] * x[2] - plane[3])
 
 
 @njit(cache=True)

@@ -8,11 +8,14 @@ from finqd.mechanics.compiled import njit
 from finqd.mechanics.contact_kernels import face_box, face_point
 from finqd.mechanics.proximity_kernels import (
     LOCALS,
+    PIECES,
     box_distance2,
     closest_on_face,
     dot3,
     faces_gap,
     local_points,
+    off_plane,
+    piece_planes,
     relative_way,
 )
 
@@ -31,7 +34,7 @@ def pairs_step_limit(
     continuous collision detection: Li, Kaufman and Jiang, ACM Trans. Graph. 40 (2021) 170, algorithm 1.
     """
     local, moves, near = np.empty((LOCALS, 3)), np.empty((LOCALS, 3)), np.empty((LOCALS, 3))
-    x, u, low, high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    x, u, low, high, planes = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((PIECES, 4))
     for p in range(pairs.shape[0]):
         way = limit * relative_way(direction, faces[pairs[p, 0]], faces[pairs[p, 1]]) / (1.0 - CLOSEST)
         if _faces_stay_apart(positions, direction, faces[pairs[p, 0]], faces[pairs[p, 1]], limit, way):
@@ -42,13 +45,23 @@ def pairs_step_limit(
             local_points(direction, faces[other], moves)
             face_box(positions, faces[other], low, high)
             lattice, first, end = face_lattice[f], pieces[other], pieces[other + 1]
+            piece_planes(local, corners, first, end, planes)
             for s in range(lattice_first[lattice], lattice_first[lattice + 1]):
                 face_point(positions, faces[f], lattice_weight[s], x)
-                if box_distance2(x, low, high) > way * way:
+                if box_distance2(x, low, high) > way * way or _off_planes(planes, end - first, x, way):
                     continue
                 face_point(direction, faces[f], lattice_weight[s], u)
                 limit = _sample_limit(x, u, local, moves, near, faces[other], corners, first, end, limit)
     return limit
+
+
+@njit(cache=True)
+def _off_planes(planes, n, x, way):
+    """Tell whether a point is farther than ``way`` [m] off all pieces of a face, as far as their planes say so."""
+    for k in range(n):
+        if off_plane(planes[k], x) <= way:
+            return False
+    return True
 
 
 @njit(cache=True)

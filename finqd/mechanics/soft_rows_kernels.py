@@ -8,11 +8,14 @@ from finqd.mechanics.compiled import njit
 from finqd.mechanics.contact_kernels import face_box, face_point
 from finqd.mechanics.proximity_kernels import (
     LOCALS,
+    PIECES,
     box_distance2,
     closest_on_triangle,
     dot3,
     faces_gap,
     local_points,
+    off_plane,
+    piece_planes,
 )
 
 
@@ -41,8 +44,10 @@ def find_rows(
         if near == 0:
             continue
         points, boxes, most = np.empty((near, LOCALS, 3)), np.empty((near, 2, 3)), 0
+        planes = np.empty((near, PIECES, 4))
         for o in range(near):
             local_points(positions, faces[ids[o]], points[o])
+            piece_planes(points[o], corners, pieces[ids[o]], pieces[ids[o] + 1], planes[o])
             face_box(positions, faces[ids[o]], boxes[o, 0], boxes[o, 1])
             most += pieces[ids[o] + 1] - pieces[ids[o]]
         who, piece, share = np.empty(5 * most, np.int64), np.empty(5 * most, np.int64), np.empty((5 * most, 3))
@@ -50,7 +55,7 @@ def find_rows(
         first, end = lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1]
         for s in range(first, end):
             face_point(positions, faces[f], lattice_weight[s], x)
-            found = _triangles_near(x, ids, near, points, boxes, pieces, corners, gap, who, piece, share)
+            found = _triangles_near(x, ids, near, points, planes, boxes, pieces, corners, gap, who, piece, share)
             if found == 0:
                 continue
             parts = _parts(
@@ -75,13 +80,15 @@ def find_rows(
 
 
 @njit(cache=True)
-def _triangles_near(x, ids, near, points, boxes, pieces, corners, gap, who, piece, share):
+def _triangles_near(x, ids, near, points, planes, boxes, pieces, corners, gap, who, piece, share):
     """Write the triangles nearer than ``gap`` to x (3,), with the closest point's share; return how many."""
     found, one = 0, np.empty(3)
     for o in range(near):
         if box_distance2(x, boxes[o, 0], boxes[o, 1]) >= gap * gap:
             continue
         for t in range(pieces[ids[o]], pieces[ids[o] + 1]):
+            if off_plane(planes[o, t - pieces[ids[o]]], x) >= gap:
+                continue
             a, b, c = points[o, corners[t, 0]], points[o, corners[t, 1]], points[o, corners[t, 2]]
             closest_on_triangle(x, a, b, c, one)
             if _distance2(x, a, b, c, one) < gap * gap:

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from finqd.design import Design, design_parameters
-from finqd.evaluate import evaluate
 from finqd.errors import InputError
+from finqd.evaluate import evaluate
 
 from .grippers import THINGS, design, gripper
-from .scenes import CONTACTS
 from .sound import sound
 
 FINGERS = {

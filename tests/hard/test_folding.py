@@ -25,7 +25,7 @@ def finger_scene(**finger):
 @pytest.mark.parametrize("contact", CONTACTS)
 @pytest.mark.parametrize("step", STEPS_MS)
 def test_ribs_pressed_into_each_other(step, contact):
-    """Ten ribs 1 mm thick that lean by 40 degrees: a bar, pushed 20 mm into the contact face, lays them on each other."""
+    """Ten ribs 1 mm thick that lean by 40 degrees: a bar 20 mm deep in the contact face lays them on each other."""
     scene, chosen, mesh = finger_scene(rib_count=10, rib_thickness_mm=1.0, rib_angle_deg=40.0)
     finger = scene.add_soft(mesh, chosen.material, name="finger")
     into = contact_normal(mesh)

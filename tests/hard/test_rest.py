@@ -31,7 +31,7 @@ def test_a_stack_of_five_soft_blocks(step, contact):
 
 
 @pytest.mark.parametrize("contact", CONTACTS)
-@pytest.mark.parametrize("step", [50, pytest.param(20, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [50, *(pytest.param(step, marks=pytest.mark.slow) for step in (5, 20))])
 def test_a_weight_on_a_block_for_a_minute(step, contact):
     """After a second it has settled; then nothing creeps (but for what `ipc` owns up to), drifts or wins energy."""
     friction, down, across = 0.5, 2.0, 9.6  # a slope of 12 degrees
