@@ -11,7 +11,7 @@ from finqd.mechanics.element_stiffness import CHUNK, HEX20_SHARE, consistent_gra
 from finqd.mechanics.elements import element
 
 CALM = 0.01  # g0 [-]: grasps of smooth objects stay below it; from 0.06 on, elements fold
-HARDENING = 40.0  # c [-]: at g = 0.06 the stress is about twice the shear modulus; later or harder takes more iterations
+HARDENING = 40.0  # c [-]: at g = 0.06 the stress is about the shear modulus; later or harder: more iterations
 STEEP = 0.2  # d1 [-]: no element that is not tangled comes as far
 
 _NONE = np.zeros((0, 3))
