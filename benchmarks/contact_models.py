@@ -109,12 +109,12 @@ def report(rows: dict[Key, dict[str, Any]]) -> None:
             if ours["held"] and other["held"] and min(ours["force_N"], other["force_N"]) > FIRM_N]
     if firm:
         off = np.array([abs(ours["force_N"] / other["force_N"] - 1.0) for ours, other in firm])
-        print(f"  forces of {len(firm)} that both hold: median {100 * np.median(off):.1f} % apart, within 5 %: "
+        print(f"  forces of {len(firm)} that both hold: {100 * np.median(off):.1f} % apart (median), within 5 %: "
               f"{np.sum(off <= 0.05)}, largest {100 * off.max():.1f} %")
     seconds = {model: [pair[i]["seconds"] for pair in whole] for i, model in enumerate(MODELS)}
     ratio = np.median(np.array(seconds["ipc"]) / np.array(seconds["penalty"]))
-    print(f"  seconds a grasp, median: penalty {np.median(seconds['penalty']):.0f}, ipc {np.median(seconds['ipc']):.0f}; "
-          f"ratio, median: {ratio:.1f}")
+    ours, other = (np.median(seconds[model]) for model in MODELS)
+    print(f"  seconds a grasp, median: penalty {ours:.0f}, ipc {other:.0f}, ratio {ratio:.1f}")
     for ours, other in pairs:
         differ = ours["held"] != other["held"] or "ok" != ours["status"] or "ok" != other["status"]
         far = None not in (ours["force_N"], other["force_N"]) and ours["held"] and other["held"] and (

@@ -41,7 +41,7 @@ def corner(number: int) -> Design:
     raise AssertionError(f"nothing can be built near corner {number}")
 
 
-@pytest.mark.parametrize("number", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 200))])
+@pytest.mark.parametrize("number", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in range(200) if n != 2)])
 def test_corners_of_the_design_space(number):
     name = ("cube", "sphere", "triangle", "cylinder")[number % 4]
     row = evaluate(corner(number), objects=[name], preset="draft").to_dict()["objects"][name]
