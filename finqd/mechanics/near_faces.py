@@ -8,10 +8,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from finqd.mechanics.contact_surface import ContactSurface
-from finqd.mechanics.proximity_kernels import CENTRE, body_box, near_pairs, refine_gaps, relative_moves, remaining_gaps
+from finqd.mechanics.proximity_kernels import (
+    CENTRE,
+    add_drift,
+    body_box,
+    longest_moves,
+    near_pairs,
+    refine_gaps,
+    relative_moves,
+    remaining_gaps,
+)
 from finqd.scene import SoftBody
 
 MARGIN = 20.0  # gaps that faces may come closer before their list is made anew
+STALE = 25  # looks at a list that may have been in vain, after which it is made anew
+WORTH = 0.1  # of the margin that bodies must have moved for that
 NOTCH = 2.0  # gaps that faces of one body are apart at rest, at least, for them to touch each other
 #: triangles of a face by its number of vertices, between its local points (see `finqd.mechanics.proximity_kernels`)
 PIECES = {
@@ -65,6 +76,9 @@ class _Watch:
 
     gaps: lower bound of the distance that each of them had there [m], (n,); seen: positions that were asked for last,
     how much nearer any faces may have come there since [m], and the lower bounds that remain (n,)
+    looks: at pairs on the list that may be nearer than the gap, since it was made
+    slack: how much nearer any of the faces may come until two are nearer than the gap [m], since the two bodies had
+    drifted by ``mark`` (2,) [m]
     """
 
     bodies: tuple[int, int]
@@ -76,6 +90,14 @@ class _Watch:
     seen: np.ndarray | None = None
     moved: float = 0.0
     remaining: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    looks: int = 0
+    slack: float = -np.inf
+    mark: tuple[float, float] = (0.0, 0.0)
+
+    def left(self, drift: np.ndarray) -> float:
+        """Return how much nearer any of the faces may come still [m], with drifts (n_bodies,) as they are now."""
+        one, other = self.bodies
+        return self.slack - float(drift[one] - self.mark[0]) - float(drift[other] - self.mark[1])
 
 
 class NearFaces:
@@ -83,7 +105,8 @@ class NearFaces:
 
     Lists are made by boxes and separating axes, with a margin, and made anew when a body has deviated from a rigid
     motion by half of it (faces of one body), or two bodies have moved by it in sum. Two bodies whose boxes are apart
-    have none. Which pairs are listed beyond those nearer than the gap depends on the way there; that must not matter.
+    have none. As long as no vertex has moved farther than faces were apart, nothing is looked at. Which pairs are
+    listed beyond those nearer than the gap depends on the way there; that must not matter.
 
     Faces of one body that share a vertex, or are nearer at rest than `NOTCH` gaps (beside a notch, or on both sides of
     the thinnest wall), never touch each other.
@@ -92,7 +115,7 @@ class NearFaces:
     def __init__(self, bodies: Sequence[SoftBody], surface: ContactSurface, *, gap: float) -> None:
         self.gap, self.margin = gap, MARGIN * gap
         self.surface, self.faces, self.triangles = surface, surface.faces, Triangulation.of(surface.faces)
-        self.spans = [(body.first_vertex, body.first_vertex + body.mesh.n_vertices) for body in bodies]
+        self.spans = np.array([(body.first_vertex, body.first_vertex + body.mesh.n_vertices) for body in bodies])
         mine = [np.flatnonzero(surface.face_body == i) for i in range(len(bodies))]
         self.watches = []
         for i in range(len(bodies)):
@@ -103,6 +126,7 @@ class NearFaces:
         self._apart = np.zeros(0, dtype=np.int64)
         rest = np.concatenate([body.mesh.vertices for body in bodies])
         self._moves = np.zeros_like(rest)
+        self._drift, self._last = np.zeros(len(bodies)), rest.copy()
         alone = [watch for watch in self.watches if len(set(watch.bodies)) == 1]
         notches = [self.pairs(rest, watch, NOTCH * gap)[0] for watch in alone]
         self._apart = np.sort(np.concatenate([pairs @ self._radix for pairs in notches]))
@@ -137,22 +161,22 @@ class NearFaces:
 
     def at(self, positions: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), lower id first, ascending, with all that are nearer than the gap at ``positions``."""
-        boxes, listed = self._boxes(positions), []
-        for watch in self.watches:
-            if self._meet(boxes, watch):
-                self._renew(positions, watch)
-                listed.append(watch.listed[self._remaining(positions, watch) <= self.gap])
-        return self._joined(listed)
+        return self._joined([self._listed(positions, watch) for watch in self._called(positions)])
 
     def on_the_way(self, positions: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), as `at` does, with all that may meet on the way to ``positions + direction``."""
+        ways = np.empty(len(self.spans))
+        longest_moves(direction, self.spans, ways)
+        called = self._called(positions, ways)
+        if not called:
+            return self._joined([])
         end, listed = positions + direction, []
         boxes = [
             (np.minimum(a, c), np.maximum(b, d))
             for (a, b), (c, d) in zip(self._boxes(positions), self._boxes(end), strict=True)
         ]
-        for watch in self.watches:
-            if not self._meet(boxes, watch):
+        for watch in called:
+            if self._apart_by(boxes, watch) > self.gap:
                 continue
             self._renew(positions, watch)
             now = self._remaining(positions, watch)
@@ -162,21 +186,43 @@ class NearFaces:
                 listed.append(self.pairs(positions, watch, self.gap, direction)[0])
         return self._joined(listed)
 
+    def _called(self, positions: np.ndarray, ways: np.ndarray | None = None) -> list[_Watch]:
+        """Return the watches whose faces may meet at ``positions``, or on ``ways`` (n_bodies,) [m] from there."""
+        if not add_drift(positions, self._last, self.spans, self._drift):
+            return self.watches  # where something is not finite
+        drift = self._drift if ways is None else self._drift + ways
+        return [watch for watch in self.watches if not watch.left(drift) > 0.0]
+
+    def _listed(self, positions: np.ndarray, watch: _Watch) -> np.ndarray:
+        """Return the pairs of a watch that may be nearer than the gap at ``positions``, and renew its slack."""
+        one, other = watch.bodies
+        watch.mark = float(self._drift[one]), float(self._drift[other])
+        apart = self._apart_by(self._boxes(positions), watch)
+        if apart > self.gap:
+            watch.slack = apart - self.gap
+            return watch.listed[:0]
+        self._renew(positions, watch)
+        remaining = self._remaining(positions, watch)
+        watch.looks += bool(np.any(remaining <= self.gap))
+        watch.slack = min(float(np.min(remaining, initial=np.inf)) - self.gap, self.margin - watch.moved)
+        return watch.listed[remaining <= self.gap]
+
     def _boxes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         boxes = [(np.empty(3), np.empty(3)) for _ in self.spans]
-        for span, box in zip(self.spans, boxes, strict=True):
+        for span, box in zip(self.spans.tolist(), boxes, strict=True):
             body_box(positions, *span, *box)
         return boxes
 
-    def _meet(self, boxes: list[tuple[np.ndarray, np.ndarray]], watch: _Watch) -> bool:
-        """Tell whether the bodies' boxes are nearer than the gap."""
+    def _apart_by(self, boxes: list[tuple[np.ndarray, np.ndarray]], watch: _Watch) -> float:
+        """Return how far the boxes of a watch's two bodies are apart along some axis [m], negative if along none."""
         (low, high), (other_low, other_high) = (boxes[b] for b in watch.bodies)
-        return not np.any((low > other_high + self.gap) | (other_low > high + self.gap))
+        return float(max(np.max(low - other_high), np.max(other_low - high)))
 
     def _renew(self, positions: np.ndarray, watch: _Watch) -> None:
         """Make the list of a watch anew where it might lack a pair at ``positions``."""
-        if watch.reference is None or not self._moved(positions, watch) <= self.margin:
-            watch.reference, watch.seen = positions, None
+        stale = watch.looks >= STALE and self._moved(positions, watch) > WORTH * self.margin
+        if watch.reference is None or stale or not self._moved(positions, watch) <= self.margin:
+            watch.reference, watch.seen, watch.looks = positions, None, 0
             watch.listed, watch.gaps = self.pairs(positions, watch, self.gap + self.margin)
 
     def _joined(self, listed: list[np.ndarray]) -> np.ndarray:

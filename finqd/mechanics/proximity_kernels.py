@@ -353,6 +353,34 @@ def body_box(positions, first, end, low, high):
 
 
 @njit(cache=True)
+def longest_moves(moves, spans, out):
+    """Write the longest of ``moves`` (n_vertices, 3) of each body to ``out`` (n_bodies,); spans (n_bodies, 2)."""
+    for b in range(spans.shape[0]):
+        most = 0.0
+        for v in range(spans[b, 0], spans[b, 1]):
+            way2 = moves[v, 0] ** 2 + moves[v, 1] ** 2 + moves[v, 2] ** 2
+            if not way2 <= most:  # takes a NaN too
+                most = way2
+        out[b] = math.sqrt(most)
+
+
+@njit(cache=True)
+def add_drift(positions, last, spans, drift):
+    """Add to ``drift`` (n_bodies,) [m] how far a vertex of each body has gone at most from ``last``, the new last.
+
+    Returns whether all that is finite; if it is not, nothing is changed.
+    """
+    moves = np.empty(spans.shape[0])
+    longest_moves(positions - last, spans, moves)
+    if not np.all(np.isfinite(moves)):
+        return False
+    for b in range(spans.shape[0]):
+        drift[b] += moves[b]
+    last[:] = positions
+    return True
+
+
+@njit(cache=True)
 def relative_moves(positions, reference, first, end, rigid, moves):
     """Write how vertices from ``first`` to ``end`` have moved from ``reference``; return the longest way, all in m.
 
