@@ -171,12 +171,8 @@ class NearFaces:
         if not called:
             return self._joined([])
         end, listed = positions + direction, []
-        boxes = [
-            (np.minimum(a, c), np.maximum(b, d))
-            for (a, b), (c, d) in zip(self._boxes(positions), self._boxes(end), strict=True)
-        ]
         for watch in called:
-            if self._apart_by(boxes, watch) > self.gap:
+            if self._apart_by(watch, positions, end) > self.gap:
                 continue
             self._renew(positions, watch)
             now = self._remaining(positions, watch)
@@ -197,26 +193,34 @@ class NearFaces:
         """Return the pairs of a watch that may be nearer than the gap at ``positions``, and renew its slack."""
         one, other = watch.bodies
         watch.mark = float(self._drift[one]), float(self._drift[other])
-        apart = self._apart_by(self._boxes(positions), watch)
+        apart = self._apart_by(watch, positions)
         if apart > self.gap:
             watch.slack = apart - self.gap
             return watch.listed[:0]
         self._renew(positions, watch)
         remaining = self._remaining(positions, watch)
-        watch.looks += bool(np.any(remaining <= self.gap))
-        watch.slack = min(float(np.min(remaining, initial=np.inf)) - self.gap, self.margin - watch.moved)
+        nearest = float(remaining.min(initial=np.inf)) - self.gap
+        watch.slack = min(nearest, self.margin - watch.moved)
+        if nearest > 0.0:
+            return watch.listed[:0]
+        watch.looks += 1
         return watch.listed[remaining <= self.gap]
 
-    def _boxes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        boxes = [(np.empty(3), np.empty(3)) for _ in self.spans]
-        for span, box in zip(self.spans.tolist(), boxes, strict=True):
-            body_box(positions, *span, *box)
-        return boxes
+    def _apart_by(self, watch: _Watch, *places: np.ndarray) -> float:
+        """Return how far the boxes of a watch's two bodies, over all ``places``, are apart along some axis [m].
 
-    def _apart_by(self, boxes: list[tuple[np.ndarray, np.ndarray]], watch: _Watch) -> float:
-        """Return how far the boxes of a watch's two bodies are apart along some axis [m], negative if along none."""
-        (low, high), (other_low, other_high) = (boxes[b] for b in watch.bodies)
-        return float(max(np.max(low - other_high), np.max(other_low - high)))
+        Negative if along none, and for the faces of one body.
+        """
+        if watch.bodies[0] == watch.bodies[1]:
+            return -np.inf
+        corners = []
+        for b in watch.bodies:
+            boxes = np.empty((len(places), 2, 3))
+            for positions, box in zip(places, boxes, strict=True):
+                body_box(positions, self.spans[b, 0], self.spans[b, 1], box[0], box[1])
+            corners.append((boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)))
+        (low, high), (other_low, other_high) = corners
+        return float(max((low - other_high).max(), (other_low - high).max()))
 
     def _renew(self, positions: np.ndarray, watch: _Watch) -> None:
         """Make the list of a watch anew where it might lack a pair at ``positions``."""
@@ -236,10 +240,10 @@ class NearFaces:
         """Return how much nearer faces of a watch may have come since its list was made [m]."""
         if watch.seen is not positions:
             watch.seen = positions
-            bodies = sorted(set(watch.bodies))
-            alone = len(bodies) == 1
-            ways = [relative_moves(positions, watch.reference, *self.spans[b], alone, self._moves) for b in bodies]
-            watch.moved, watch.remaining = (1 + alone) * float(sum(ways)), np.empty(len(watch.listed))
+            alone, spans, way = watch.bodies[0] == watch.bodies[1], self.spans, 0.0
+            for b in watch.bodies[alone:]:
+                way += relative_moves(positions, watch.reference, spans[b, 0], spans[b, 1], alone, self._moves)
+            watch.moved, watch.remaining = (1 + alone) * way, np.empty(len(watch.listed))
             remaining_gaps(self._moves, self.faces, watch.faces, watch.listed, watch.gaps, watch.remaining)
         return watch.moved
 
