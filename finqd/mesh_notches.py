@@ -43,7 +43,7 @@ def with_quarter_nodes(mesh: Mesh) -> Mesh:
     vertices = mesh.vertices.copy()
     for kind, nodes in mesh.blocks.items():
         sides = np.array(MID_EDGES[kind])
-        ends, middle = nodes[:, sides], nodes[:, -len(sides) :]
+        ends, middle = nodes[:, sides], middle_nodes(mesh, kind)
         for tip, far in ((ends[..., 0], ends[..., 1]), (ends[..., 1], ends[..., 0])):
             moved = notch[tip] & ~notch[far]
             start, end = mesh.vertices[tip[moved]], mesh.vertices[far[moved]]

@@ -378,3 +378,31 @@ def test_a_run_with_soft_contact_goes_on_with_the_same_bits(tmp_path) -> None:
         collide(friction=0.5, checkpoint=path, checkpoint_every=0.0, progress=stop)
     rest, *_ = collide(friction=0.5, checkpoint=path)
     assert whole.soft_positions.tobytes() == rest.soft_positions.tobytes()
+
+
+def test_what_is_remembered_of_the_way_changes_nothing() -> None:
+    """Two blocks that stray, jump far away and come back: contacts are those of a potential that has seen nothing."""
+    generator = np.random.default_rng(4)
+
+    def made() -> tuple[SoftContact, np.ndarray]:
+        scene, pose = Scene(), np.eye(4)
+        pose[2, 3] = 0.0105
+        scene.add_soft(box_mesh((0.01, 0.01, 0.01), (2, 2, 2)), RUBBER)
+        scene.add_soft(box_mesh((0.01, 0.01, 0.01), (2, 2, 2)).transformed(pose), RUBBER)
+        contact = Penalty().potential(scene)
+        return contact.soft, np.concatenate([body.mesh.vertices for body in scene.soft_bodies])
+
+    old, rest = made()
+    upper, touched = np.arange(len(rest)) >= len(rest) // 2, 0
+    for i in range(60):
+        places = rest + 2e-5 * generator.normal(size=rest.shape)
+        places[upper, 2] -= generator.uniform(0.0, 4.6e-4)
+        if i % 20 == 10:
+            places[upper] += 1e9 if i == 30 else np.nan
+        old.find(places)
+        fresh, _ = made()
+        fresh.find(places)
+        touched += old.rows.count > 0
+        for one, other in zip(old.rows.arrays, fresh.rows.arrays, strict=True):
+            np.testing.assert_array_equal(one[: old.rows.count], other[: fresh.rows.count])
+    assert 10 < touched < 57

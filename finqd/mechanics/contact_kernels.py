@@ -19,6 +19,8 @@ from finqd.mechanics.distance_kernels import distance_curvature, signed_distance
 from finqd.mechanics.rotation_kernels import rotation_matrix
 
 CLEAR = 1.0 - 1e-9  # of a distance that counts as free way, for rounding
+ROUNDING = 1e-9  # [m] of a distance that does not, where ways are added up
+LONGEST = 1e3  # [m] sum of ways from which on it is begun anew: small ways would be lost in it
 MARCH = 20.0  # allowances of a move after which points that slide along a body are not followed any farther
 
 
@@ -66,6 +68,25 @@ def add_travel(positions, faces, centre, rotation, local, travel):
 
 
 @njit(cache=True)
+def _face_away(positions, nodes, centre, rotation, field, radius, low, high, x):
+    """Return a lower bound of a face's distance from a body, and the distance of its box's middle, x (3,) [m].
+
+    Of a face beside the box of the body's bounding ball the second is infinite; low, high: scratch (3,)
+    """
+    face_box(positions, nodes, low, high)
+    beside, size2, y = 0.0, 0.0, np.empty(3)
+    for i in range(3):
+        beside = max(beside, low[i] - centre[i] - radius, centre[i] - radius - high[i])
+        x[i] = 0.5 * (low[i] + high[i])
+        size2 += (high[i] - low[i]) ** 2
+    if beside > 0.0:
+        return beside, np.inf
+    _into_body(x, centre, rotation, y)
+    d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
+    return d - 0.5 * math.sqrt(size2), d
+
+
+@njit(cache=True)
 def find_soft_rigid(
     positions, faces, face_area, face_lattice, lattice_first, lattice_weight, lattice_share, first_sample, pressure,
     centre, rotation, field, radius, local, travel, face_clear, clear, rigid, first_key, out_key, out_face, out_weight,
@@ -82,21 +103,14 @@ def find_soft_rigid(
     x, y, last = np.empty(3), np.empty(3), np.empty(3)
     low, high = np.empty(3), np.empty(3)
     for f in range(faces.shape[0]):
+        if not travel[f] < LONGEST:
+            travel[f], face_clear[f] = 0.0, -1.0
+            clear[first_sample[f] : first_sample[f + 1]] = -1.0
         if travel[f] < face_clear[f]:
             continue
-        face_box(positions, faces[f], low, high)
-        apart, size2 = False, 0.0
-        for i in range(3):
-            if low[i] > centre[i] + radius or high[i] < centre[i] - radius:
-                apart = True
-            x[i] = 0.5 * (low[i] + high[i])
-            size2 += (high[i] - low[i]) ** 2
-        if apart:
-            continue
-        _into_body(x, centre, rotation, y)
-        d, _, _, _ = signed_distance(field, y[0], y[1], y[2])
-        if d > 0.5 * math.sqrt(size2):
-            face_clear[f] = travel[f] + CLEAR * (d - 0.5 * math.sqrt(size2))
+        away, d = _face_away(positions, faces[f], centre, rotation, field, radius, low, high, x)
+        if away > 0.0:
+            face_clear[f] = travel[f] + away - ROUNDING
             continue
         last[:] = x
         first, end = lattice_first[face_lattice[f]], lattice_first[face_lattice[f] + 1]
@@ -108,13 +122,13 @@ def find_soft_rigid(
             face_point(positions, faces[f], lattice_weight[s], x)
             apart2 = (x[0] - last[0]) ** 2 + (x[1] - last[1]) ** 2 + (x[2] - last[2]) ** 2
             if d > 0.0 and apart2 < d * d:
-                clear[sample] = travel[f] + CLEAR * (d - math.sqrt(apart2))
+                clear[sample] = travel[f] + d - math.sqrt(apart2) - ROUNDING
                 continue
             last[:] = x
             _into_body(x, centre, rotation, y)
             d, n0, n1, n2 = signed_distance(field, y[0], y[1], y[2])
             if d >= 0.0:
-                clear[sample] = travel[f] + CLEAR * d
+                clear[sample] = travel[f] + d - ROUNDING
                 continue
             if count < out_key.shape[0]:
                 out_key[count] = first_key + sample

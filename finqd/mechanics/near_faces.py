@@ -23,6 +23,7 @@ from finqd.scene import SoftBody
 MARGIN = 20.0  # gaps that faces may come closer before their list is made anew
 STALE = 25  # looks at a list that may have been in vain, after which it is made anew
 WORTH = 0.1  # of the margin that bodies must have moved for that
+ROUNDING = 1e-9  # [m] of a distance that does not count as free way, as ways are added up
 NOTCH = 2.0  # gaps that faces of one body are apart at rest, at least, for them to touch each other
 #: triangles of a face by its number of vertices, between its local points (see `finqd.mechanics.proximity_kernels`)
 PIECES = {
@@ -184,8 +185,11 @@ class NearFaces:
 
     def _called(self, positions: np.ndarray, ways: np.ndarray | None = None) -> list[_Watch]:
         """Return the watches whose faces may meet at ``positions``, or on ``ways`` (n_bodies,) [m] from there."""
-        if not add_drift(positions, self._last, self.spans, self._drift):
-            return self.watches  # where something is not finite
+        if not add_drift(positions, self._last, self.spans, self._drift):  # something is far off, or no number
+            self._last, self._drift = positions.copy(), np.zeros(len(self.spans))
+            for watch in self.watches:
+                watch.slack = -np.inf
+            return self.watches
         drift = self._drift if ways is None else self._drift + ways
         return [watch for watch in self.watches if not watch.left(drift) > 0.0]
 
@@ -195,12 +199,12 @@ class NearFaces:
         watch.mark = float(self._drift[one]), float(self._drift[other])
         apart = self._apart_by(watch, positions)
         if apart > self.gap:
-            watch.slack = apart - self.gap
+            watch.slack = apart - self.gap - ROUNDING
             return watch.listed[:0]
         self._renew(positions, watch)
         remaining = self._remaining(positions, watch)
         nearest = float(remaining.min(initial=np.inf)) - self.gap
-        watch.slack = min(nearest, self.margin - watch.moved)
+        watch.slack = min(nearest, self.margin - watch.moved) - ROUNDING
         if nearest > 0.0:
             return watch.listed[:0]
         watch.looks += 1

@@ -16,6 +16,7 @@ from finqd.mechanics.polar_kernels import closest_rotation
 CENTRE = 8  # local number of a quadrilateral's middle
 LOCALS = 9  # local points of a face at most
 PIECES = 8  # triangles of a face at most
+LONGEST = 1e3  # [m] sum of ways beside which short ones would be lost
 ROUNDED = 1.0 - 1e-9  # of a distance from a plane that counts, for rounding
 
 
@@ -368,11 +369,11 @@ def longest_moves(moves, spans, out):
 def add_drift(positions, last, spans, drift):
     """Add to ``drift`` (n_bodies,) [m] how far a vertex of each body has gone at most from ``last``, the new last.
 
-    Returns whether all that is finite; if it is not, nothing is changed.
+    Returns whether all that is finite, and no more than `LONGEST`; if it is not, nothing is changed.
     """
     moves = np.empty(spans.shape[0])
     longest_moves(positions - last, spans, moves)
-    if not np.all(np.isfinite(moves)):
+    if not np.all(drift + moves <= LONGEST):
         return False
     for b in range(spans.shape[0]):
         drift[b] += moves[b]

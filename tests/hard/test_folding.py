@@ -41,7 +41,7 @@ def test_ribs_pressed_into_each_other(step, contact):
 @pytest.mark.parametrize("contact", CONTACTS)
 @pytest.mark.parametrize("step", STEPS_MS)
 def test_a_finger_folded_back_on_itself(step, contact):
-    """The last 20 mm are turned back by 150 degrees, about an axis through the finger's middle."""
+    """The last 12 mm are turned back by 150 degrees, about an axis through the finger's middle."""
     scene, chosen, mesh = finger_scene()
     finger = scene.add_soft(mesh, chosen.material, name="finger")
     finger.fix("base")
