@@ -235,6 +235,32 @@ def test_lists_of_near_faces_lose_nothing_whatever_the_way_there() -> None:
     assert min(seen) < max(seen) and max(seen) > 20
 
 
+def test_moves_that_were_looked_at_before_they_were_gone_lose_nothing() -> None:
+    """Arms that close bit by bit: whole moves, whose ends are known by then, and moves that were cut or not made."""
+    scene = Scene()
+    scene.add_soft(clip(), RUBBER)
+    system, generator, seen = System(scene, contact=Penalty()), np.random.default_rng(5), []
+    soft, state = system.contact.soft, system.initial_state()
+    rest, share, whole = state.positions, 0.0, 0
+    arms = np.sign(rest[:, 2] - rest[:, 2].mean()) * (rest[:, 1] / 0.02) ** 2
+    assert not system.contact.soft.rows.count
+    for k in range(60):
+        share = min(share + generator.uniform(-0.03, 0.1), 1.0)
+        goal = rest - np.outer(arms, [0.0, 0.0, share * 1.0e-3]) + 1e-5 * generator.normal(size=rest.shape)
+        direction = Direction(soft=goal - state.positions, rigid=np.zeros((0, 6)))
+        limit = soft.step_limit(state, direction, 1.0)
+        whole += limit == 1.0
+        if k % 7 != 3:
+            state = state.moved(direction, limit * (0.5 if k % 5 == 4 else 1.0))
+        soft.find(state.positions)
+        fresh: SoftContact = System(scene, contact=Penalty()).contact.soft
+        fresh.find(state.positions)
+        assert np.array_equal(soft.keys, fresh.keys)
+        assert np.array_equal(soft.forces(), fresh.forces())
+        seen.append(fresh.rows.count)
+    assert min(seen) == 0 and max(seen) > 20 and 15 < whole < 50
+
+
 def test_a_move_ends_before_it_goes_through_a_thin_sheet() -> None:
     scene = Scene()
     scene.add_soft(box_mesh((0.02, 0.02, 0.0005), (4, 4, 1)), RUBBER)

@@ -51,9 +51,10 @@ class Triangulation:
     @classmethod
     def of(cls, faces: np.ndarray) -> Triangulation:
         """Cut up ``faces`` (n_faces, k)."""
-        cut = [PIECES[int(n)] for n in np.sum(faces >= 0, axis=1)]
+        tables = {n: np.array(pieces, dtype=np.int64) for n, pieces in PIECES.items()}
+        cut = [tables[n] for n in np.sum(faces >= 0, axis=1).tolist()]
         first = np.concatenate([[0], np.cumsum([len(pieces) for pieces in cut])]).astype(np.int64)
-        corners = np.array([corners for pieces in cut for corners in pieces], dtype=np.int64).reshape(-1, 3)
+        corners = np.concatenate([np.zeros((0, 3), dtype=np.int64), *cut])
         owner = np.repeat(np.arange(len(faces)), np.diff(first))
         inner = np.where(corners == CENTRE, 0, corners)
         middles = int(faces.max(initial=-1)) + 1 + owner
@@ -75,8 +76,9 @@ class Triangulation:
 class _Watch:
     """Pairs of faces of one body, or of two, that were near at ``reference`` (n_vertices, 3).
 
-    gaps: lower bound of the distance that each of them had there [m], (n,); seen: positions that were asked for last,
-    how much nearer any faces may have come there since [m], and the lower bounds that remain (n,)
+    gaps: lower bound of the distance that each of them had there [m], (n,); near: the faces of these pairs
+    seen: positions that were asked for last; moved, remaining: how much nearer any faces may have come there since [m],
+    and the lower bounds that remain (n,)
     looks: at pairs on the list that may be nearer than the gap, since it was made
     slack: how much nearer any of the faces may come until two are nearer than the gap [m], since the two bodies had
     drifted by ``mark`` (2,) [m]
@@ -88,6 +90,7 @@ class _Watch:
     reference: np.ndarray | None = None
     listed: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     gaps: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    near: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     seen: np.ndarray | None = None
     moved: float = 0.0
     remaining: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -128,6 +131,9 @@ class NearFaces:
         rest = np.concatenate([body.mesh.vertices for body in bodies])
         self._moves = np.zeros_like(rest)
         self._drift, self._last = np.zeros(len(bodies)), rest.copy()
+        self._here: np.ndarray | None = None  # what `_last` is a copy of
+        self._end = self._same = rest  # where the last move was to end, and an array with the same numbers
+        self._room = 256  # for pairs
         alone = [watch for watch in self.watches if len(set(watch.bodies)) == 1]
         notches = [self.pairs(rest, watch, NOTCH * gap)[0] for watch in alone]
         self._apart = np.sort(np.concatenate([pairs @ self._radix for pairs in notches]))
@@ -143,7 +149,7 @@ class NearFaces:
 
         And lower bounds (n,) of their distances [m]. With a ``direction`` (n_vertices, 3) [m]: anywhere on the way.
         """
-        found, gaps, moving = np.zeros((256, 2), dtype=np.int64), np.zeros(256), direction is not None
+        found, gaps, moving = np.zeros((self._room, 2), dtype=np.int64), np.zeros(self._room), direction is not None
         moves = positions if direction is None else direction
         while True:
             count = near_pairs(
@@ -158,20 +164,23 @@ class NearFaces:
                 refine_gaps(positions, *self.surface.lattices, *triangles, found, gaps, NOTCH * self.gap)
                 near = gaps < reach
                 return found[near], gaps[near]
-            found, gaps = np.zeros((2 * count, 2), dtype=np.int64), np.zeros(2 * count)
+            self._room = 2 * count
+            found, gaps = np.zeros((self._room, 2), dtype=np.int64), np.zeros(self._room)
 
     def at(self, positions: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), lower id first, ascending, with all that are nearer than the gap at ``positions``."""
+        positions = self._known(positions)
         return self._joined([self._listed(positions, watch) for watch in self._called(positions)])
 
     def on_the_way(self, positions: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), as `at` does, with all that may meet on the way to ``positions + direction``."""
-        ways = np.empty(len(self.spans))
+        positions, ways = self._known(positions), np.empty(len(self.spans))
         longest_moves(direction, self.spans, ways)
         called = self._called(positions, ways)
         if not called:
             return self._joined([])
         end, listed = positions + direction, []
+        self._end = self._same = end
         for watch in called:
             if self._apart_by(watch, positions, end) > self.gap:
                 continue
@@ -183,9 +192,20 @@ class NearFaces:
                 listed.append(self.pairs(positions, watch, self.gap, direction)[0])
         return self._joined(listed)
 
+    def _known(self, positions: np.ndarray) -> np.ndarray:
+        """Return the array that has been looked at if ``positions`` are the same numbers: most moves are gone whole."""
+        if positions is self._same:
+            return self._end
+        if np.array_equal(positions, self._end):
+            self._same = positions
+            return self._end
+        return positions
+
     def _called(self, positions: np.ndarray, ways: np.ndarray | None = None) -> list[_Watch]:
         """Return the watches whose faces may meet at ``positions``, or on ``ways`` (n_bodies,) [m] from there."""
-        if not add_drift(positions, self._last, self.spans, self._drift):  # something is far off, or no number
+        far = positions is not self._here and not add_drift(positions, self._last, self.spans, self._drift)
+        self._here = positions
+        if far:  # or no number
             self._last, self._drift = positions.copy(), np.zeros(len(self.spans))
             for watch in self.watches:
                 watch.slack = -np.inf
@@ -232,6 +252,7 @@ class NearFaces:
         if watch.reference is None or stale or not self._moved(positions, watch) <= self.margin:
             watch.reference, watch.seen, watch.looks = positions, None, 0
             watch.listed, watch.gaps = self.pairs(positions, watch, self.gap + self.margin)
+            watch.near = np.unique(watch.listed)
 
     def _joined(self, listed: list[np.ndarray]) -> np.ndarray:
         listed = [pairs for pairs in listed if len(pairs)]
@@ -248,7 +269,7 @@ class NearFaces:
             for b in watch.bodies[alone:]:
                 way += relative_moves(positions, watch.reference, spans[b, 0], spans[b, 1], alone, self._moves)
             watch.moved, watch.remaining = (1 + alone) * way, np.empty(len(watch.listed))
-            remaining_gaps(self._moves, self.faces, watch.faces, watch.listed, watch.gaps, watch.remaining)
+            remaining_gaps(self._moves, self.faces, watch.near, watch.listed, watch.gaps, watch.remaining)
         return watch.moved
 
     def _remaining(self, positions: np.ndarray, watch: _Watch) -> np.ndarray:

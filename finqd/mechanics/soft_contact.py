@@ -175,6 +175,8 @@ class SoftContact:
     def lag(self, start: State, *, bound: np.ndarray, slips: np.ndarray) -> None:
         """Take the frictional contacts of this step from the samples: ``bound`` mu N [N] and stored ``slips`` [m]."""
         used = np.flatnonzero(bound > 0.0)
+        if not len(used) and not len(self.friction.key):
+            return
         self.friction = self._friction(self.points[used], start.positions, bound[used], slips[used])
 
     def _friction(
