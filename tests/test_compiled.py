@@ -24,11 +24,14 @@ def calling(x):
 
 
 def answer(folder: Path, source: str, factor: float) -> float:
-    """Write both files into ``folder`` and return what a new process makes of them."""
+    """Write both files into ``folder`` and return what a new process makes of them.
+
+    Without Python's own cache: it knows sources by size and whole seconds, and would take a quick edit for no change.
+    """
     (folder / "called_kernels.py").write_text(CALLED.format(source=source, factor=factor))
     (folder / "calling_kernels.py").write_text(CALLING.format(source=source))
     program = "import calling_kernels; print(calling_kernels.calling(10.0))"
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache")}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=folder, env=environment, capture_output=True, text=True, check=True
     )
