@@ -10,13 +10,13 @@ from there; a line whose design has changed since is done again. Prints verdicts
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from json_rows import add_row, read_rows
 
 from finqd.data import designs_folder
 from finqd.design import Design, design_parameters
@@ -65,8 +65,7 @@ def simulate(task: tuple[Key, Design, float]) -> dict[str, Any] | None:
 def read_log(log: Path, wanted: dict[Key, Design]) -> dict[Key, dict[str, Any]]:
     """Return the rows that still hold."""
     rows = {}
-    for text in log.read_text().splitlines() if log.exists() else []:
-        row = json.loads(text)
+    for row in read_rows(log):
         key = row["design"], row["object"], row["contact"]
         if key in wanted and wanted[key].digest() == row["digest"]:
             rows[key] = row
@@ -86,8 +85,7 @@ def run(arguments: argparse.Namespace) -> dict[Key, dict[str, Any]]:
             print(*key, row.kind, row.reason, flush=True)
         elif row is not None:
             rows[key] = row
-            with log.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            add_row(log, row)
             force = "-" if row["force_N"] is None else f"{row['force_N']:.2f} N"
             print(*key, row["status"], "held" if row["held"] else "lost", force, f"{row['seconds']:.0f} s", flush=True)
 

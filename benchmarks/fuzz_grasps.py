@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import collections
-import json
 import math
 import time
 from collections.abc import Iterable
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from json_rows import add_row, read_rows
 from scipy.stats import qmc
 
 from finqd.design import Design, design_parameters
@@ -122,15 +122,10 @@ def is_finite(trajectory: Trajectory) -> bool:
 
 
 def read_log(log: Path, wanted: list[Case]) -> dict[tuple[str, int], dict[str, Any]]:
-    """Return the rows that still hold; a line that a kill cut short is left out."""
+    """Return the rows that still hold."""
     digests = {(case.suite, case.number): case.design.digest() for case in wanted}
     rows = {}
-    for text in log.read_text().splitlines() if log.exists() else []:
-        try:
-            row = json.loads(text)
-        except json.JSONDecodeError:
-            print("a damaged line of the log is left out")
-            continue
+    for row in read_rows(log):
         key = row["suite"], row["number"]
         if digests.get(key) == row["digest"]:
             rows[key] = row
@@ -152,8 +147,7 @@ def run(arguments: argparse.Namespace, wanted: list[Case]) -> dict[tuple[str, in
             kind = "hang" if row.kind == "timeout" else "crash"
             row = {**named(case), "status": kind, "reason": row.reason, "finite": True, "held": False, "seconds": 0.0}
         rows[case.suite, case.number] = row
-        with log.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+        add_row(log, row)
         print(f"{case.suite} {case.number} {case.grasped}: {row['status']} {row['seconds']:.0f} s {row['reason']}",
               flush=True)
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from json_rows import add_row, read_rows
 from scipy.stats import qmc
 
 from finqd.data import designs_folder, studies_folder
@@ -121,14 +121,9 @@ def key(row: dict[str, Any]) -> Grasp:
 
 
 def read_log(log: Path, known: dict[str, Design], limit_s: float) -> dict[Grasp, dict[str, Any]]:
-    """Return the rows that still hold; a line that a kill cut short is left out."""
+    """Return the rows that still hold."""
     rows: dict[Grasp, dict[str, Any]] = {}
-    for text in log.read_text().splitlines() if log.exists() else []:
-        try:
-            row = json.loads(text)
-        except json.JSONDecodeError:
-            print("a damaged line of the log is left out", file=sys.stderr)
-            continue
+    for row in read_rows(log):
         grasp = key(row)
         if row["digest"] == prepared(grasp, known[grasp.design], limit_s).digest():
             rows[grasp] = row
@@ -139,8 +134,6 @@ def run(arguments: argparse.Namespace, wanted: list[Pair]) -> dict[Grasp, dict[s
     """Simulate what the log does not hold yet, until the time is up; return all rows."""
     log, known = Path(arguments.log), designs()
     rows = read_log(log, known, arguments.limit_s)
-    if log.exists() and not log.read_text().endswith("\n"):
-        log.write_text(log.read_text() + "\n")  # the line that a kill cut short must not swallow the next
     deadline = time.time() + 60.0 * arguments.budget_minutes
     todo = dict.fromkeys(grasp for pair in wanted for grasp in (pair.ours, pair.other))
     simulate_missing(arguments, known, rows, list(todo), set(), deadline)
@@ -167,8 +160,7 @@ def simulate_missing(
             print(f"{grasps[index]}: {row.kind}: {row.reason}", flush=True)
         elif row is not None:
             rows[key(row)] = row
-            with log.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            add_row(log, row)
             print(f"{row['design']:10s} {row['object']:10s} {row['preset']:10s} {words(row)}", flush=True)
 
     run_tasks(simulate, tasks, jobs=arguments.jobs, on_result=on_result)
