@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from json_rows import add_row, read_rows
+from checkout import commit, commits
 
 from finqd.data import designs_folder
 from finqd.design import Design, design_parameters
 from finqd.evaluate import evaluate
 from finqd.objects import object_names
 from finqd.presets import apply_preset
+from finqd.study_log import append_row, read_rows
 from finqd.workers import TaskFailure, run_tasks
 
 SEED = 5
@@ -75,7 +76,7 @@ def read_log(log: Path, wanted: dict[Key, Design]) -> dict[Key, dict[str, Any]]:
 def run(arguments: argparse.Namespace) -> dict[Key, dict[str, Any]]:
     """Simulate what the log does not hold yet, until the time is up; return all rows."""
     log, wanted = Path(arguments.log), tasks()
-    rows = read_log(log, wanted)
+    rows, source = read_log(log, wanted), commit()
     deadline = time.time() + 60.0 * arguments.minutes
     left = [(key, design, deadline) for key, design in wanted.items() if key not in rows]
 
@@ -84,8 +85,8 @@ def run(arguments: argparse.Namespace) -> dict[Key, dict[str, Any]]:
         if isinstance(row, TaskFailure):
             print(*key, row.kind, row.reason, flush=True)
         elif row is not None:
-            rows[key] = row
-            add_row(log, row)
+            rows[key] = {**row, "commit": source}
+            append_row(log, rows[key])
             force = "-" if row["force_N"] is None else f"{row['force_N']:.2f} N"
             print(*key, row["status"], "held" if row["held"] else "lost", force, f"{row['seconds']:.0f} s", flush=True)
 
@@ -97,7 +98,7 @@ def run(arguments: argparse.Namespace) -> dict[Key, dict[str, Any]]:
 def report(rows: dict[Key, dict[str, Any]]) -> None:
     """Print what the two models agree in, and what each costs."""
     pairs = [(rows[key], rows[*key[:2], "ipc"]) for key in rows if key[2] == "penalty" and (*key[:2], "ipc") in rows]
-    print(f"\n{len(pairs)} of {10 * (1 + DRAWN)} grasps with both models")
+    print(f"\n{len(pairs)} of {10 * (1 + DRAWN)} grasps with both models; simulations: {commits(rows.values())}")
     whole = [(ours, other) for ours, other in pairs if ours["status"] == other["status"] == "ok"]
     same = [ours["held"] == other["held"] for ours, other in whole]
     if not whole:

@@ -25,13 +25,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from json_rows import add_row, read_rows
+from checkout import commit, commits
 from scipy.stats import qmc
 
 from finqd.design import Design, design_parameters
 from finqd.evaluate import evaluate
 from finqd.objects import object_names
 from finqd.presets import apply_preset
+from finqd.study_log import append_row, read_rows
 from finqd.trajectory import Trajectory
 from finqd.workers import TaskFailure, run_tasks
 
@@ -135,7 +136,7 @@ def read_log(log: Path, wanted: list[Case]) -> dict[tuple[str, int], dict[str, A
 def run(arguments: argparse.Namespace, wanted: list[Case]) -> dict[tuple[str, int], dict[str, Any]]:
     """Simulate what the log does not hold yet, until the time is up; return all rows."""
     log = Path(arguments.log)
-    rows = read_log(log, wanted)
+    rows, source = read_log(log, wanted), commit()
     deadline = time.time() + 60.0 * arguments.minutes
     left = [case for case in wanted if (case.suite, case.number) not in rows]
 
@@ -146,8 +147,9 @@ def run(arguments: argparse.Namespace, wanted: list[Case]) -> dict[tuple[str, in
         if isinstance(row, TaskFailure):
             kind = "hang" if row.kind == "timeout" else "crash"
             row = {**named(case), "status": kind, "reason": row.reason, "finite": True, "held": False, "seconds": 0.0}
+        row["commit"] = source
         rows[case.suite, case.number] = row
-        add_row(log, row)
+        append_row(log, row)
         print(f"{case.suite} {case.number} {case.grasped}: {row['status']} {row['seconds']:.0f} s {row['reason']}",
               flush=True)
 
@@ -174,6 +176,7 @@ def report(rows: list[dict[str, Any]], suite: str) -> None:
     seconds = np.array([row["seconds"] for row in rows])
     print(f"  seconds a grasp: median {np.median(seconds):.1f}, 95 % below {np.quantile(seconds, 0.95):.1f}, "
           f"largest {seconds.max():.1f}")
+    print(f"  {commits(rows)}")
     for row in rows:
         if row["status"] != "ok" or not row["finite"]:
             print(f"  {row['number']}, {row['object']}: {row['status']}: {row['reason']}")

@@ -12,16 +12,16 @@ import argparse
 import collections
 import math
 import random
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from json_rows import add_row, read_rows
+from checkout import FOLDER, commit, commits
+
+from finqd.study_log import append_row, read_rows
 
 SEED = 4
-FOLDER = Path(__file__).resolve().parents[1]
 
 
 class Collected:
@@ -38,31 +38,30 @@ class Log:
     """Writes a line when a case ends, and ends the session when the time is up."""
 
     def __init__(self, path: Path, *, deadline: float) -> None:
-        self.path, self.deadline = path, deadline
-        told = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=FOLDER, capture_output=True, text=True)
-        self.commit = told.stdout.strip() or "unknown"
+        self.path, self.deadline, self.commit = path, deadline, commit()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Write how a case ended: its own phase, or another that failed or was left out."""
         if report.when == "call" or not report.passed:
             row = {"case": report.nodeid, "outcome": report.outcome, "seconds": round(report.duration, 1),
-                   "commit": self.commit, "reason": last_line(report)}
-            add_row(self.path, row)
+                   "commit": self.commit, "reason": first_line(report)}
+            append_row(self.path, row)
         if time.time() > self.deadline:
             pytest.exit("the time is up", returncode=0)
 
 
-def last_line(report: pytest.TestReport) -> str:
+def first_line(report: pytest.TestReport) -> str:
     """Return the sentence that pytest's own summary would give for a failure; nothing for a pass."""
     crash = getattr(report.longrepr, "reprcrash", None)
-    return "" if report.passed else str(crash.message if crash else report.longrepr).splitlines()[0]
+    return "" if report.passed else str(crash.message if crash else report.longrepr).partition("\n")[0]
 
 
 def all_cases() -> list[str]:
     """Return the names of all hard cases, in the order that `SEED` draws."""
     found = Collected()
     options = ["--collect-only", "-p", "no:terminal", "-p", "no:cacheprovider"]
-    pytest.main([*options, str(FOLDER / "tests" / "hard")], plugins=[found])
+    if pytest.main([*options, str(FOLDER / "tests" / "hard")], plugins=[found]) != pytest.ExitCode.OK:
+        raise SystemExit("the cases can't be collected: try pytest --collect-only tests/hard")
     return random.Random(SEED).sample(found.ids, len(found.ids))
 
 
@@ -83,7 +82,7 @@ def report(rows: list[dict[str, Any]], count: int) -> None:
         seconds = sorted(row["seconds"] for row in members)
         print(f"  {family:18s} {len(members):4d}  {dict(outcomes)}  median {seconds[len(seconds) // 2]:.0f} s, "
               f"longest {seconds[-1]:.0f} s")
-    print("  on commits", dict(collections.Counter(row["commit"] for row in rows)))
+    print(f"  {commits(rows)}")
     for row in rows:
         if row["outcome"] != "passed":
             print(f"  {row['case']}: {row['outcome']}: {row['reason']}")

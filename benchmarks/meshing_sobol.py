@@ -11,7 +11,6 @@ not meshed, an inverted element, or a volume that differs by more than 1e-9.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -25,6 +24,7 @@ from finqd.meshing import mesh_solid
 from finqd.plugins.geometry_fin_ray import FinRay
 from finqd.plugins.mesher_swept import Swept
 from finqd.plugins.mesher_tetrahedral import Tetrahedral
+from finqd.study_log import append_row, read_rows
 
 LIMIT = 1e-9
 
@@ -54,16 +54,14 @@ def run(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             Tetrahedral(size_mm=arguments.tetrahedral_mm, order=arguments.order),
     }
     meshers = {name: mesher for name, mesher in meshers.items() if name.startswith(arguments.only)}
-    rows = [json.loads(line) for line in arguments.log.read_text().splitlines()] if arguments.log.exists() else []
+    rows = read_rows(arguments.log)
     done = {(row["mesher"], row["finger"]) for row in rows}
-    with arguments.log.open("a") as log:
-        for number, finger in enumerate(sobol_fingers(arguments.designs, arguments.seed)):
-            for name, mesher in meshers.items():
-                if (name, number) not in done:
-                    row = {"mesher": name, "finger": number, **measure(mesher, finger, arguments.time_limit_s)}
-                    rows.append(row)
-                    log.write(json.dumps(row) + "\n")
-                    log.flush()
+    for number, finger in enumerate(sobol_fingers(arguments.designs, arguments.seed)):
+        for name, mesher in meshers.items():
+            if (name, number) not in done:
+                row = {"mesher": name, "finger": number, **measure(mesher, finger, arguments.time_limit_s)}
+                rows.append(row)
+                append_row(arguments.log, row)
     return [row for row in rows if row["mesher"] in meshers and row["finger"] < 3 * arguments.designs]
 
 

@@ -12,11 +12,11 @@ import argparse
 import json
 from pathlib import Path
 
-from finqd.accuracy_log import read_rows
 from finqd.accuracy_reference import read_reference
 from finqd.data import studies_folder
 from finqd.presets import PRESETS
 from finqd.runlog import write_whole
+from finqd.study_log import read_rows
 
 
 def main() -> None:

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from verdict_flips import designs
 
-from finqd.accuracy_log import append_row, read_rows
 from finqd.data import studies_folder
 from finqd.design import Design
 from finqd.presets import PRESETS, apply_preset
 from finqd.provenance import versions
 from finqd.runlog import write_whole
+from finqd.study_log import append_row, read_rows
 from finqd.verification.press import REFERENCE, press_finger
 from finqd.workers import TaskFailure, run_tasks
 

@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from json_rows import add_row, read_rows
 from scipy.stats import qmc
 
 from finqd.data import designs_folder, studies_folder
@@ -39,6 +38,7 @@ from finqd.evaluate import evaluate
 from finqd.objects import object_names
 from finqd.presets import PRESETS, apply_preset
 from finqd.runlog import write_whole
+from finqd.study_log import append_row, read_rows
 from finqd.workers import TaskFailure, run_tasks
 
 SEED = 20
@@ -160,7 +160,7 @@ def simulate_missing(
             print(f"{grasps[index]}: {row.kind}: {row.reason}", flush=True)
         elif row is not None:
             rows[key(row)] = row
-            add_row(log, row)
+            append_row(log, row)
             print(f"{row['design']:10s} {row['object']:10s} {row['preset']:10s} {words(row)}", flush=True)
 
     run_tasks(simulate, tasks, jobs=arguments.jobs, on_result=on_result)

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 
 from finqd.accuracy_cases import Case, Measure, expected_seconds, measured
 from finqd.accuracy_ladder import Rung, build_ladder, options_text, reference_rungs
-from finqd.accuracy_log import append_row, read_rows
 from finqd.accuracy_machine import describe_machine
 from finqd.accuracy_reference import Reference, error_of, make_reference, shipped_reference
 from finqd.errors import InputError
 from finqd.presets import DEFAULT, PRESETS
+from finqd.study_log import append_row, read_rows
 from finqd.workers import TaskFailure, run_tasks
 
 if TYPE_CHECKING:

@@ -34,7 +34,6 @@ from finqd.accuracy_ladder import (
     reference_rungs,
     without_numerics,
 )
-from finqd.accuracy_log import append_row, read_rows
 from finqd.accuracy_plot import _free_place
 from finqd.accuracy_reference import (
     error_of,
@@ -49,6 +48,7 @@ from finqd.data import studies_folder
 from finqd.design import Design, parse_setting
 from finqd.errors import InputError
 from finqd.presets import PRESETS, apply_preset
+from finqd.study_log import append_row, read_rows
 from finqd.workers import TaskFailure
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -298,7 +298,7 @@ def test_a_log_that_is_none_is_refused_and_no_log_is_no_rows(tmp_path):
     path = tmp_path / LOG
     assert read_rows(path) == []
     path.write_text('{"rung": "a"}\nthis is a letter\n{"rung": "b"}\n')
-    with pytest.raises(InputError, match="line 2 is no row of an accuracy study"):
+    with pytest.raises(InputError, match="line 2 is no row of a study"):
         read_rows(path)
     path.write_text('{"rung": "a"}\n{"rung":')
     append_row(path, {"rung": "b", "seconds": float("nan")})

@@ -1,7 +1,7 @@
-"""The log of an accuracy study: one JSON line a rung, on disk before the next rung starts; it can be taken up again.
+"""The log of a study: one JSON line a row, on disk before the next one is computed; it can be taken up again.
 
 >>> import tempfile
->>> path = Path(tempfile.mkdtemp()) / "accuracy.jsonl"
+>>> path = Path(tempfile.mkdtemp()) / "study.jsonl"
 >>> append_row(path, {"rung": "draft", "seconds": 1.5})
 >>> _ = path.write_text(path.read_text() + '{"rung": "fi')  # cut in the middle of a line
 >>> [row["rung"] for row in read_rows(path)]
@@ -41,13 +41,14 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         if isinstance(row, dict):
             rows.append(row)
         elif any(rest.strip() for rest in lines[number:]) or line.strip():
-            raise InputError(f"line {number} is no row of an accuracy study; move the file away", str(path))
+            raise InputError(f"line {number} is no row of a study; move the file away", str(path))
     return rows
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Write one row behind the last whole line, and wait until it is on the disk."""
+    """Write one row behind the last whole line, and wait until it is on the disk; make the folder if there is none."""
     text = json.dumps(plain(row), allow_nan=False) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab+") as file:
         file.truncate(_whole(file))
         file.write(text.encode())
