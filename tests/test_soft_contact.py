@@ -10,6 +10,7 @@ import pytest
 from finqd.errors import InputError
 from finqd.mechanics import soft_contact_kernels as kernels
 from finqd.mechanics.material import Material
+from finqd.mechanics.near_faces_kernels import called_watches, gaps_left, relative_moves, same_numbers
 from finqd.mechanics.proximity_kernels import closest_on_triangle, faces_gap
 from finqd.mechanics.rotation_kernels import rotation_matrix
 from finqd.mechanics.soft_contact import SoftContact
@@ -198,6 +199,68 @@ def test_switched_off_nothing_is_there() -> None:
 
 
 # -- what is near ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.kernel
+def test_a_rigid_motion_brings_no_points_of_one_body_nearer() -> None:
+    generator = np.random.default_rng(2)
+    reference = generator.normal(size=(20, 3))
+    turned = reference @ rotation_matrix(np.array([0.3, -2.0, 1.0])).T + [1.0, -2.0, 0.5]
+    moves = np.full((20, 3), np.nan)
+    assert relative_moves(turned, reference, 4, 16, True, moves) < 1e-14
+    assert np.abs(moves[4:16]).max() < 1e-14 and np.isnan(moves[:4]).all() and np.isnan(moves[16:]).all()
+    assert relative_moves(turned, reference, 4, 16, False, moves) > 1.0
+    turned[7] += [0.0, 0.2, 0.0]
+    assert 0.15 < relative_moves(turned, reference, 4, 16, True, moves) < 0.25
+    turned[7, 1] = np.nan
+    assert np.isnan(relative_moves(turned, reference, 4, 16, True, moves))
+
+
+@pytest.mark.kernel
+@pytest.mark.parametrize("bodies", [(0, 0), (0, 1)])
+def test_faces_are_never_nearer_than_what_is_said_to_be_left(bodies: tuple[int, int]) -> None:
+    generator = np.random.default_rng(4)
+    spans, faces = np.array([[0, 8], [8, 16]]), np.arange(16).reshape(4, 4)
+    listed = np.array([[0, 1], [1, 0]]) if bodies == (0, 0) else np.array([[0, 2], [1, 3], [0, 3]])
+
+    def apart(positions: np.ndarray) -> np.ndarray:
+        ends = [positions[faces[listed[:, side]]] for side in (0, 1)]
+        return np.linalg.norm(ends[0][:, :, None] - ends[1][:, None], axis=-1).min(axis=(1, 2))
+
+    for size in np.repeat([0.01, 0.1, 1.0], 20):
+        reference = generator.normal(size=(16, 3))
+        positions = reference + size * generator.normal(size=(16, 3))
+        positions[:8] = positions[:8] @ rotation_matrix(generator.normal(size=3) * (bodies == (0, 0))).T
+        left, gaps = np.empty(len(listed)), apart(reference)
+        way = gaps_left(
+            positions, reference, spans, *bodies, np.zeros((16, 3)), faces, np.unique(listed), listed, gaps, left
+        )
+        assert (left <= apart(positions) + 1e-12).all()
+        assert (gaps - way <= apart(positions) + 1e-12).all()
+
+
+@pytest.mark.kernel
+def test_bodies_are_looked_at_when_their_slack_is_used_up_and_when_it_is_unknown() -> None:
+    spans, bodies = np.array([[0, 2], [2, 4]]), np.array([[0, 0], [0, 1], [1, 1]])
+    last, drift, mark, out = np.zeros((4, 3)), np.zeros(2), np.zeros((3, 2)), np.zeros(3, dtype=np.int64)
+    slack, still = np.array([1.0, 1.0, 1.0]), np.zeros((4, 3))
+
+    def called(positions: np.ndarray, direction: np.ndarray = still, *, moved: bool = True, moving: bool = False):
+        count = called_watches(positions, moved, direction, moving, spans, last, drift, bodies, slack, mark, out)
+        return None if count < 0 else out[:count].tolist()
+
+    moves = still.copy()
+    moves[1, 2] = 0.6  # both faces of a body may go as far: twice that is more than the slack, once is not
+    assert called(still) == [] and called(still, moves, moving=True) == [0] and called(moves) == [0]
+    assert drift.tolist() == [0.6, 0.0] and np.array_equal(last, moves)
+    assert called(moves, moves, moved=False, moving=True) == [0, 1]
+    assert called(still) == [0, 1] and drift.tolist() == [1.2, 0.0]  # ways add up, there and back
+    mark[:] = drift[bodies]
+    assert called(still) == []
+    assert called(still, np.full((4, 3), np.nan), moving=True) == [0, 1, 2]
+    assert called(np.full((4, 3), np.nan)) is None and called(still + 1e4) is None
+    assert drift.tolist() == [1.2, 0.0]
+    assert same_numbers(still, still.copy()) and not same_numbers(still, moves) and not same_numbers(still, still[:3])
 
 
 def clip(*, arm: float = 0.02, between: float = 0.002) -> Mesh:

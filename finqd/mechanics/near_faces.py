@@ -8,22 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from finqd.mechanics.contact_surface import ContactSurface
-from finqd.mechanics.proximity_kernels import (
-    CENTRE,
-    add_drift,
-    body_box,
-    longest_moves,
-    near_pairs,
-    refine_gaps,
-    relative_moves,
-    remaining_gaps,
-)
+from finqd.mechanics.near_faces_kernels import body_box, called_watches, gaps_left, same_numbers
+from finqd.mechanics.proximity_kernels import CENTRE, near_pairs, refine_gaps
 from finqd.scene import SoftBody
 
 MARGIN = 20.0  # gaps that faces may come closer before their list is made anew
 STALE = 25  # looks at a list that may have been in vain, after which it is made anew
 WORTH = 0.1  # of the margin that bodies must have moved for that
 ROUNDING = 1e-9  # [m] of a distance that does not count as free way, as ways are added up
+NONE = np.zeros((0, 2), dtype=np.int64)  # pairs of faces
 NOTCH = 2.0  # gaps that faces of one body are apart at rest, at least, for them to touch each other
 #: triangles of a face by its number of vertices, between its local points (see `finqd.mechanics.proximity_kernels`)
 PIECES = {
@@ -62,8 +55,9 @@ class Triangulation:
         _, vertices = np.unique(points, return_inverse=True)
         vertices = vertices.reshape(-1, 3)
         ends = np.sort(np.stack([vertices, np.roll(vertices, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-        _, edges, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-        open_ends = ends[counts[edges.ravel()] != 2]
+        keys = ends @ np.array([len(points) * points.shape[1], 1])  # sorting numbers is ten times as fast as rows
+        _, edges, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        open_ends = ends[counts[edges] != 2]
         valence = np.bincount(vertices.ravel()) if len(vertices) else np.zeros(0, dtype=np.int64)
         valence[np.unique(open_ends)] = -1
         return cls(
@@ -80,10 +74,9 @@ class _Watch:
     seen: positions that were asked for last; moved, remaining: how much nearer any faces may have come there since [m],
     and the lower bounds that remain (n,)
     looks: at pairs on the list that may be nearer than the gap, since it was made
-    slack: how much nearer any of the faces may come until two are nearer than the gap [m], since the two bodies had
-    drifted by ``mark`` (2,) [m]
     """
 
+    number: int
     bodies: tuple[int, int]
     faces: np.ndarray
     side: np.ndarray
@@ -95,13 +88,6 @@ class _Watch:
     moved: float = 0.0
     remaining: np.ndarray = field(default_factory=lambda: np.zeros(0))
     looks: int = 0
-    slack: float = -np.inf
-    mark: tuple[float, float] = (0.0, 0.0)
-
-    def left(self, drift: np.ndarray) -> float:
-        """Return how much nearer any of the faces may come still [m], with drifts (n_bodies,) as they are now."""
-        one, other = self.bodies
-        return self.slack - float(drift[one] - self.mark[0]) - float(drift[other] - self.mark[1])
 
 
 class NearFaces:
@@ -121,12 +107,17 @@ class NearFaces:
         self.surface, self.faces, self.triangles = surface, surface.faces, Triangulation.of(surface.faces)
         self.spans = np.array([(body.first_vertex, body.first_vertex + body.mesh.n_vertices) for body in bodies])
         mine = [np.flatnonzero(surface.face_body == i) for i in range(len(bodies))]
-        self.watches = []
+        self.watches: list[_Watch] = []
         for i in range(len(bodies)):
             for j in range(i, len(bodies)):
                 one, other = mine[i], mine[j] if j > i else mine[i][:0]
                 ids, side = np.concatenate([one, other]), np.repeat([0, 1], [len(one), len(other)])
-                self.watches.append(_Watch((i, j), ids, side))
+                self.watches.append(_Watch(len(self.watches), (i, j), ids, side))
+        n = len(self.watches)
+        self._bodies = np.array([watch.bodies for watch in self.watches], dtype=np.int64).reshape(n, 2)
+        # how much nearer a watch's faces may come until two are nearer than the gap [m], since its bodies had drifted
+        self._slack, self._mark = np.full(n, -np.inf), np.zeros((n, 2))  # by the marks [m]
+        self._numbers = np.zeros(n, dtype=np.int64)
         self._apart = np.zeros(0, dtype=np.int64)
         rest = np.concatenate([body.mesh.vertices for body in bodies])
         self._moves = np.zeros_like(rest)
@@ -174,11 +165,10 @@ class NearFaces:
 
     def on_the_way(self, positions: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), as `at` does, with all that may meet on the way to ``positions + direction``."""
-        positions, ways = self._known(positions), np.empty(len(self.spans))
-        longest_moves(direction, self.spans, ways)
-        called = self._called(positions, ways)
+        positions = self._known(positions)
+        called = self._called(positions, direction)
         if not called:
-            return self._joined([])
+            return NONE
         end, listed = positions + direction, []
         self._end = self._same = end
         for watch in called:
@@ -196,37 +186,39 @@ class NearFaces:
         """Return the array that has been looked at if ``positions`` are the same numbers: most moves are gone whole."""
         if positions is self._same:
             return self._end
-        if np.array_equal(positions, self._end):
+        if positions is not self._here and same_numbers(positions, self._end):
             self._same = positions
             return self._end
         return positions
 
-    def _called(self, positions: np.ndarray, ways: np.ndarray | None = None) -> list[_Watch]:
-        """Return the watches whose faces may meet at ``positions``, or on ``ways`` (n_bodies,) [m] from there."""
-        far = positions is not self._here and not add_drift(positions, self._last, self.spans, self._drift)
+    def _called(self, positions: np.ndarray, direction: np.ndarray | None = None) -> list[_Watch]:
+        """Return the watches whose faces may meet at ``positions``, or on the way along ``direction`` from there."""
+        moves, moving = (positions, False) if direction is None else (direction, True)
+        count = called_watches(
+            positions, positions is not self._here, moves, moving, self.spans, self._last, self._drift, self._bodies,
+            self._slack, self._mark, self._numbers,
+        )
         self._here = positions
-        if far:  # or no number
+        if count < 0:  # far, or no number
             self._last, self._drift = positions.copy(), np.zeros(len(self.spans))
-            for watch in self.watches:
-                watch.slack = -np.inf
+            self._slack[:] = -np.inf
             return self.watches
-        drift = self._drift if ways is None else self._drift + ways
-        return [watch for watch in self.watches if not watch.left(drift) > 0.0]
+        return [self.watches[i] for i in self._numbers[:count].tolist()] if count else []
 
     def _listed(self, positions: np.ndarray, watch: _Watch) -> np.ndarray:
         """Return the pairs of a watch that may be nearer than the gap at ``positions``, and renew its slack."""
-        one, other = watch.bodies
-        watch.mark = float(self._drift[one]), float(self._drift[other])
+        k, (one, other) = watch.number, watch.bodies
+        self._mark[k, 0], self._mark[k, 1] = self._drift[one], self._drift[other]
         apart = self._apart_by(watch, positions)
         if apart > self.gap:
-            watch.slack = apart - self.gap - ROUNDING
-            return watch.listed[:0]
+            self._slack[k] = apart - self.gap - ROUNDING
+            return NONE
         self._renew(positions, watch)
         remaining = self._remaining(positions, watch)
         nearest = float(remaining.min(initial=np.inf)) - self.gap
-        watch.slack = min(nearest, self.margin - watch.moved) - ROUNDING
+        self._slack[k] = min(nearest, self.margin - watch.moved) - ROUNDING
         if nearest > 0.0:
-            return watch.listed[:0]
+            return NONE
         watch.looks += 1
         return watch.listed[remaining <= self.gap]
 
@@ -257,7 +249,7 @@ class NearFaces:
     def _joined(self, listed: list[np.ndarray]) -> np.ndarray:
         listed = [pairs for pairs in listed if len(pairs)]
         if len(listed) < 2:
-            return listed[0] if listed else np.zeros((0, 2), dtype=np.int64)
+            return listed[0] if listed else NONE
         found = np.concatenate(listed)
         return found[np.argsort(found @ self._radix)]
 
@@ -265,11 +257,11 @@ class NearFaces:
         """Return how much nearer faces of a watch may have come since its list was made [m]."""
         if watch.seen is not positions:
             watch.seen = positions
-            alone, spans, way = watch.bodies[0] == watch.bodies[1], self.spans, 0.0
-            for b in watch.bodies[alone:]:
-                way += relative_moves(positions, watch.reference, spans[b, 0], spans[b, 1], alone, self._moves)
-            watch.moved, watch.remaining = (1 + alone) * way, np.empty(len(watch.listed))
-            remaining_gaps(self._moves, self.faces, watch.near, watch.listed, watch.gaps, watch.remaining)
+            watch.remaining = np.empty(len(watch.listed))
+            watch.moved = gaps_left(
+                positions, watch.reference, self.spans, *watch.bodies, self._moves, self.faces, watch.near,
+                watch.listed, watch.gaps, watch.remaining,
+            )
         return watch.moved
 
     def _remaining(self, positions: np.ndarray, watch: _Watch) -> np.ndarray:

@@ -11,12 +11,10 @@ import numpy as np
 
 from finqd.mechanics.compiled import njit
 from finqd.mechanics.contact_kernels import face_box, face_point
-from finqd.mechanics.polar_kernels import closest_rotation
 
 CENTRE = 8  # local number of a quadrilateral's middle
 LOCALS = 9  # local points of a face at most
 PIECES = 8  # triangles of a face at most
-LONGEST = 1e3  # [m] sum of ways beside which short ones would be lost
 ROUNDED = 1.0 - 1e-9  # of a distance from a plane that counts, for rounding
 
 
@@ -214,13 +212,13 @@ def _normal(positions, nodes, normal):
 @njit(cache=True)
 def relative_way(direction, a, b):
     """Return a bound of how far any point of one face moves relative to any of the other [m]."""
-    a0, a1, a2, spread_a = _mean_move(direction, a)
-    b0, b1, b2, spread_b = _mean_move(direction, b)
+    a0, a1, a2, spread_a = mean_move(direction, a)
+    b0, b1, b2, spread_b = mean_move(direction, b)
     return math.sqrt((a0 - b0) ** 2 + (a1 - b1) ** 2 + (a2 - b2) ** 2) + spread_a + spread_b
 
 
 @njit(cache=True)
-def _mean_move(direction, nodes):
+def mean_move(direction, nodes):
     """Return the mean move of a face's vertices (three numbers), and how far that of any is from it [m]."""
     x = y = z = 0.0
     n = 0
@@ -341,98 +339,3 @@ def _share_vertex(a, b):
                 if i == j:
                     return True
     return False
-
-
-@njit(cache=True)
-def body_box(positions, first, end, low, high):
-    """Write the box of the vertices from ``first`` to ``end`` [m]."""
-    for i in range(3):
-        low[i], high[i] = np.inf, -np.inf
-    for v in range(first, end):
-        for i in range(3):
-            low[i], high[i] = min(low[i], positions[v, i]), max(high[i], positions[v, i])
-
-
-@njit(cache=True)
-def longest_moves(moves, spans, out):
-    """Write the longest of ``moves`` (n_vertices, 3) of each body to ``out`` (n_bodies,); spans (n_bodies, 2)."""
-    for b in range(spans.shape[0]):
-        most = 0.0
-        for v in range(spans[b, 0], spans[b, 1]):
-            way2 = moves[v, 0] ** 2 + moves[v, 1] ** 2 + moves[v, 2] ** 2
-            if not way2 <= most:  # takes a NaN too
-                most = way2
-        out[b] = math.sqrt(most)
-
-
-@njit(cache=True)
-def add_drift(positions, last, spans, drift):
-    """Add to ``drift`` (n_bodies,) [m] how far a vertex of each body has gone at most from ``last``, the new last.
-
-    Returns whether all that is finite, and no more than `LONGEST`; if it is not, nothing is changed.
-    """
-    moves = np.empty(spans.shape[0])
-    for b in range(spans.shape[0]):
-        most = 0.0
-        for v in range(spans[b, 0], spans[b, 1]):
-            way2 = 0.0
-            for i in range(3):
-                way2 += (positions[v, i] - last[v, i]) ** 2
-            if not way2 <= most:  # takes a NaN too
-                most = way2
-        moves[b] = math.sqrt(most)
-    if not np.all(drift + moves <= LONGEST):
-        return False
-    for b in range(spans.shape[0]):
-        drift[b] += moves[b]
-    last[:] = positions
-    return True
-
-
-@njit(cache=True)
-def relative_moves(positions, reference, first, end, rigid, moves):
-    """Write how vertices from ``first`` to ``end`` have moved from ``reference``; return the longest way, all in m.
-
-    rigid: after the best rigid motion in the mean square has been taken away, in the frame of the reference (Kabsch,
-    Acta Cryst. A32 (1976) 922)
-    """
-    n = end - first
-    here, there, turn = np.zeros(3), np.zeros(3), np.eye(3)
-    if rigid:
-        for v in range(first, end):
-            for i in range(3):
-                here[i] += positions[v, i] / n
-                there[i] += reference[v, i] / n
-        spread = np.zeros((3, 3))
-        for v in range(first, end):
-            for i in range(3):
-                for j in range(3):
-                    spread[i, j] += (positions[v, i] - here[i]) * (reference[v, j] - there[j])
-        closest_rotation(spread, turn)
-    largest = 0.0
-    for v in range(first, end):
-        x, y, z = positions[v, 0] - here[0], positions[v, 1] - here[1], positions[v, 2] - here[2]
-        way2 = 0.0
-        for i in range(3):
-            moves[v, i] = turn[0, i] * x + turn[1, i] * y + turn[2, i] * z - (reference[v, i] - there[i])
-            way2 += moves[v, i] ** 2
-        if not way2 <= largest:  # takes a NaN too
-            largest = way2
-    return math.sqrt(largest)
-
-
-@njit(cache=True)
-def remaining_gaps(moves, faces, ids, listed, gaps, out):
-    """Write a lower bound of the distance of each pair ``listed`` (n, 2); ``gaps`` (n,): one before ``moves``.
-
-    ids: of all faces that are listed, or more; the bound is that of `relative_way`.
-    """
-    mean, spread = np.empty((faces.shape[0], 3)), np.empty(faces.shape[0])
-    for f in ids:
-        mean[f, 0], mean[f, 1], mean[f, 2], spread[f] = _mean_move(moves, faces[f])
-    for p in range(listed.shape[0]):
-        a, b = listed[p, 0], listed[p, 1]
-        way2 = 0.0
-        for i in range(3):
-            way2 += (mean[a, i] - mean[b, i]) ** 2
-        out[p] = gaps[p] - math.sqrt(way2) - spread[a] - spread[b]

@@ -22,6 +22,7 @@ from finqd.scene import Scene
 
 NOTHING = 1e-3  # share of the gap that is none
 AHEAD = 1e-3  # [m] faces that are nearer than this to faces in touch get room in the Hessian with them
+NO_SLIPS = KeyedValues.of(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
 
 @dataclass(kw_only=True)
@@ -165,8 +166,15 @@ class SoftContact:
         owner, n = self.surface.face_body, self.rows.count
         return owner[self.rows.face[:n]], owner[self.rows.other[:n]]
 
+    @property
+    def _touching(self) -> bool:
+        """Whether anything touches, or has friction from the last renewal."""
+        return self.rows.count > 0 or len(self.friction.key) > 0
+
     def bounds(self) -> np.ndarray:
         """Return mu N of each sample in touch [N]."""
+        if not self.rows.count:
+            return np.zeros(0)
         one, other = self.bodies()
         return self.coefficients[one[self.points], other[self.points]] * self.loads
 
@@ -205,6 +213,8 @@ class SoftContact:
 
     def mapped_slips(self, positions: np.ndarray) -> KeyedValues:
         """Return the elastic slips at the end of a step, by the samples' numbers: return mapping of the trial ones."""
+        if not len(self.friction.key):
+            return NO_SLIPS
         slips = self.trial_slips(positions)
         return_mapping(slips, self.friction.bound, self.friction.stiffness, len(slips))
         return KeyedValues.of(self.friction.key, slips)
@@ -215,6 +225,8 @@ class SoftContact:
         """Return contact and friction energy [J]."""
         self.find(positions)
         rows, f = self.rows, self.friction
+        if not self._touching:
+            return 0.0
         energy = kernels.rows_energy(rows.distance, self.gap, rows.stiffness, rows.count)
         return energy + friction_energy(self.trial_slips(positions), f.bound, f.stiffness, len(f.key))
 
@@ -222,6 +234,8 @@ class SoftContact:
         """Add the gradient [N] to ``gradient`` (n_vertices, 3); return the energy [J]."""
         self.find(positions)
         rows, f, faces = self.rows, self.friction, self.surface.faces
+        if not self._touching:
+            return 0.0
         energy = kernels.add_gradient(
             faces, rows.face, rows.weight, rows.other, self.triangles.corners, rows.piece, rows.share, rows.distance,
             rows.normal, rows.stiffness, rows.count, self.gap, gradient,
@@ -254,10 +268,9 @@ class SoftContact:
 
     def step_limit(self, state: State, direction: Direction, limit: float) -> float:
         """Return the share of ``direction``, up to ``limit``, on which no sample meets another face."""
-        if not direction.soft.any():
-            return limit
-        pairs = self.near.on_the_way(state.positions, limit * direction.soft)
-        if not len(pairs):
+        moves = direction.soft if limit == 1.0 else limit * direction.soft
+        pairs = self.near.on_the_way(state.positions, moves)
+        if not len(pairs) or not direction.soft.any():
             return limit
         s = self.surface
         return pairs_step_limit(
