@@ -41,10 +41,25 @@ def corner(number: int) -> Design:
     raise AssertionError(f"nothing can be built near corner {number}")
 
 
-@pytest.mark.parametrize("number", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in range(200) if n != 2)])
+CORNERS = [2, *(pytest.param(n, marks=pytest.mark.slow) for n in range(200) if n != 2)]
+
+
+@pytest.mark.parametrize("number", CORNERS)
 def test_corners_of_the_design_space(number):
+    check_corner(number, "penalty")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(0, 200, 9))  # with each of the four objects; `ipc` takes several times as long
+def test_corners_of_the_design_space_with_ipc(number):
+    check_corner(number, "ipc")
+
+
+def check_corner(number: int, contact: str) -> None:
+    """Run the grasp of a corner's gripper."""
     name = ("cube", "sphere", "triangle", "cylinder")[number % 4]
-    row = evaluate(corner(number), objects=[name], preset="draft").to_dict()["objects"][name]
+    result = evaluate(corner(number), objects=[name], preset="draft", overrides={"contact.name": contact}).to_dict()
+    row = result["objects"][name]
     assert row["status"] in ("ok", "no_room"), row["reason"]
     if row["status"] == "ok":
         assert np.isfinite([row["drop_mm"], *row["final_contact_force_N"]]).all()
