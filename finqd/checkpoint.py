@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from finqd.scene import Scene
 
 FORMAT = "finqd checkpoint"
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ def _state_arrays(state: State) -> Iterator[tuple[str, np.ndarray]]:
 
 def _state(arrays: Mapping[str, np.ndarray]) -> State:
     values: dict[str, Any] = dict(arrays)
-    return State(**{**values, "time": float(values["time"])})
+    return State(**{**values, **{name: float(values[name]) for name in ("time", "step")}})
 
 
 def fingerprint(scene: Scene, **settings: Any) -> str:

@@ -93,7 +93,7 @@ class Evaluation:
             "final_contact_force_N": [float(f) for f in forces[-1]] if simulated else None,
             "max_penetration_mm": _finite(np.max(penetrations, initial=0.0) / MM) if simulated else None,
             "final_height_mm": _finite(object_heights(trajectory)[-1] / MM) if simulated else None,
-            "simulated_s": float(trajectory.times[-1]) if simulated else 0.0,
+            "simulated_s": float(trajectory.times[-1]) if simulated else 0.0, "ended": trajectory.ended,
             "steps": trajectory.counters.get("steps", 0),
             "newton_iterations": trajectory.counters.get("newton_iterations", 0),
             "counters": dict(trajectory.counters),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from finqd.early_verdict import EarlyVerdict
 from finqd.placement import placement
 from finqd.scene import Scene, Shift, Timed
 from finqd.simulate import simulate
@@ -54,6 +55,15 @@ def lift_start(protocol: GraspProtocol) -> float:
 def grasp_duration(protocol: GraspProtocol) -> float:
     """Return the length of a grasp [s]."""
     return lift_start(protocol) + protocol.si("lift_s") + protocol.si("hold_s")
+
+
+def early_verdict(design: Design) -> EarlyVerdict:
+    """Return what tells whether a grasp by ``design`` is decided before its end."""
+    protocol = design.protocol
+    return EarlyVerdict(
+        lift=lift_start(protocol), hold=lift_start(protocol) + protocol.si("lift_s"), end=grasp_duration(protocol),
+        rise=protocol.si("lift_mm"), threshold=protocol.si("drop_threshold_mm"), stepper=design.plugin("stepper"),
+    )
 
 
 def base_height(meshes: Sequence[Mesh], protocol: GraspProtocol) -> float:
@@ -153,6 +163,7 @@ def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Tra
         scene, duration=grasp_duration(protocol), time_step=protocol.time_step_ms * MS,
         stepper=design.plugin("stepper"), contact=design.plugin("contact"), record=task.record,
         wall_clock_limit=protocol.si("wall_clock_limit_s"), progress=progress, checkpoint=task.checkpoint,
+        longest_step=protocol.calm_step_factor, decided=early_verdict(design) if protocol.early_verdict else None,
     )
     return replace(
         trajectory, object_name=task.grasped.name, protocol=protocol, object_drop=object_drop(trajectory, protocol),

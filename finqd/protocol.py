@@ -48,6 +48,10 @@ class GraspProtocol:
         10.0, "an object that drops less than this relative to the gripper is held"
     )
     time_step_ms: Annotated[float, Ge(0.001), Le(1000)] = _constant(10.0, "largest time step")
+    calm_step_factor: Annotated[int, Ge(1), Le(16)] = _constant(
+        1, "time steps that one may span where nothing happens: what does in it is gone through in single ones"
+    )
+    early_verdict: bool = _constant(True, "a grasp whose verdict is certain in the hold is not simulated to its end")
     wall_clock_limit_s: Annotated[float, Gt(0), Le(1e6)] = _constant(600.0, "a simulation is given up after this time")
 
     def si(self, key: str) -> float:

@@ -113,7 +113,11 @@ class Motion:
 
     def pose(self, progress: float, time: float) -> np.ndarray:
         """Return the (4, 4) motion of the driven vertices since the start of the scene."""
-        pose = self.path.pose(eased(progress))
+        return self.mount(time) @ self.path.pose(eased(progress))
+
+    def mount(self, time: float) -> np.ndarray:
+        """Return the (4, 4) motion of what the drive is mounted on since the start of the scene."""
+        pose = np.eye(4)
         for carrier in self.carriers:
             pose = carrier.pose(time) @ pose
         return pose

@@ -6,7 +6,7 @@ import math
 import os
 import time as clock
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,15 +18,14 @@ from finqd.checkpoint import Checkpoint, fingerprint
 from finqd.errors import InputError
 from finqd.mechanics.state import State, StepReport
 from finqd.mechanics.system import System
+from finqd.step_control import JUMP, Contacts, StepControl, Timetable, hasty, way_is_free
 from finqd.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from finqd.scene import Scene
-
-HALVINGS = 8  # a step is halved at most this often before the simulation ends as diverged
-CALM_STEPS = 2  # steps that must succeed before a halved step is doubled again
-EASY = 10  # Newton iterations of such a step; one that takes more would hardly succeed at twice the length,
-HARD_STEP = 0.25  # and counts for this much
+#: asked at a frame: system, state, and by name what has been recorded of all frames so far
+Decided = Callable[[System, State, Mapping[str, Sequence[Any]]], str]
+KEPT = ("halvings", "calm", "proposed", "span", "quiet")  # of the step control, in a checkpoint
 
 
 @dataclass(kw_only=True)
@@ -79,59 +78,22 @@ class _Recorder:
 
 
 @dataclass(kw_only=True)
-class _StepControl:
-    """How long the next step is: halved where one fails, doubled when calm; or what the stepper proposes.
-
-    frame: longest step [s]; proposed: the stepper's own opinion [s], None as long as it has none
-    """
-
-    frame: float
-    halvings: int = 0
-    calm: float = 0.0
-    proposed: float | None = None
-
-    @property
-    def shortest(self) -> float:
-        return self.frame / 2**HALVINGS
-
-    def length(self, left: float) -> float:
-        """Return the next step [s], of ``left`` [s] to the end of the frame."""
-        if self.proposed is None:
-            return min(self.frame / 2**self.halvings, left)
-        # equal steps to the end of the frame, so that none is a remainder
-        return left / max(math.ceil(left / self.proposed * (1 - 1e-9)), 1)
-
-    def judge(self, report: StepReport, dt: float) -> bool:
-        """Take what a step of ``dt`` says; return whether to go on."""
-        if report.next_dt is not None:
-            if not report.converged and dt <= self.shortest * (1 + 1e-9):
-                return False
-            self.proposed = min(max(report.next_dt, self.shortest), self.frame)
-        elif report.converged:
-            self.calm += 1.0 if report.iterations <= EASY else HARD_STEP
-            if self.calm >= CALM_STEPS and self.halvings:
-                self.halvings, self.calm = self.halvings - 1, 0.0
-        elif self.halvings == HALVINGS:
-            return False
-        else:
-            self.halvings, self.calm = self.halvings + 1, 0.0
-        return True
-
-
-@dataclass(kw_only=True)
 class _Run:
     """A simulation on its way: ``done`` of its ``frames`` are behind it."""
 
     system: System
     stepper: Any
     recorder: _Recorder
-    control: _StepControl
+    control: StepControl
     state: State
     duration: float
     frames: int
     done: int = 0
     status: str = "ok"
     reason: str = ""
+    ended: str = ""
+    decided: Decided | None = None
+    timetable: Timetable = field(default_factory=Timetable)
     report: StepReport = field(default_factory=StepReport)
 
     def start(self) -> None:
@@ -141,8 +103,10 @@ class _Run:
         self.recorder.frame(self.system, self.state)
 
     def go(self, after_step: Callable[[], None], progress: Callable[[float], None] | None) -> None:
-        """Step to the end, or until ``status`` is not "ok" any more."""
-        while self.done < self.frames:
+        """Step to the end, until ``decided`` says why that need not be reached, or ``status`` is not "ok" any more."""
+        while self.done < self.frames and not self.ended:
+            if self._long_step():
+                after_step()
             frame_end = self.duration * (self.done + 1) / self.frames
             while self.status == "ok" and self.state.time < frame_end * (1 - 1e-12):
                 self._step(frame_end - self.state.time)
@@ -151,18 +115,53 @@ class _Run:
                 break
             self.recorder.frame(self.system, self.state)
             self.done += 1
+            self.ended = "" if self.decided is None else self.decided(self.system, self.state, self.recorder.rows)
             if progress is not None:
-                progress(self.done / self.frames)
+                progress(1.0 if self.ended else self.done / self.frames)
 
     def _step(self, left: float) -> None:
         dt = self.control.length(left)
+        before = self.system.contact.soft_forces
         self.state, self.report = self.stepper.step(self.system, self.state, dt)
-        self.recorder.count(self.report)
-        penetration = self.system.contact.penetration
-        self.recorder.largest_penetration = max(self.recorder.largest_penetration, penetration)
+        self._count()
         if not self.control.judge(self.report, dt):
             self.status = "diverged"
             self.reason = f"at t = {self.state.time:.4f} s, dt = {dt:.2g} s: {self.report.reason}"
+        self.control.look(self.report, Contacts(before, self.system.contact.soft_forces).change)
+
+    def _count(self) -> None:
+        """Take what the last step says of itself."""
+        self.recorder.count(self.report)
+        self.recorder.largest_penetration = max(self.recorder.largest_penetration, self.system.contact.penetration)
+
+    def _long_step(self) -> bool:
+        """Try a step of several frames, where nothing has happened lately; take it back if something does in it."""
+        control, system, start = self.control, self.system, self.state
+        frame = control.frame
+        if control.span == 1 or abs(start.time - self.done * frame) > 1e-9 * frame:
+            return False
+        span = self.timetable.frames(start.time, frame, min(control.span, self.frames - self.done))
+        if span == 1:
+            return False
+        before = system.contact.soft_forces
+        if not np.any(before > 0.0) and not way_is_free(system, start, span * frame):
+            control.begin_anew()
+            return False
+        kept, deepest = system.contact.history(), self.recorder.largest_penetration
+        end = self.duration * (self.done + span) / self.frames
+        self.state, self.report = hasty(self.stepper).step(system, start, end - start.time)
+        change = Contacts(before, system.contact.soft_forces).change if self.report.converged else 1.0
+        if change > JUMP:
+            system.contact.restore(kept)
+            self.report.converged = False
+            self.state, self.recorder.largest_penetration = start, deepest
+            self.recorder.count(self.report)
+            control.begin_anew()
+            return False
+        self._count()
+        control.look(self.report, change / span)
+        self.done += span - 1  # its last frame is recorded as any other
+        return True
 
 
 @dataclass(kw_only=True)
@@ -195,8 +194,8 @@ class _Keeper:
         rows, control = run.recorder.rows, run.control
         header = {
             "done": run.done, "status": run.status, "reason": run.reason, "counters": run.recorder.counters,
-            "largest_penetration": run.recorder.largest_penetration, "halvings": control.halvings,
-            "calm": control.calm, "proposed": control.proposed,
+            "largest_penetration": run.recorder.largest_penetration, "ended": run.ended,
+            **{name: getattr(control, name) for name in KEPT},
         }
         return Checkpoint(
             fingerprint=self.fingerprint, state=run.state, history=run.system.history(),
@@ -220,8 +219,9 @@ class _Keeper:
         run.system.restore(kept.history)
         run.recorder.rows = {name: list(values) for name, values in kept.rows.items()}
         run.recorder.counters, run.recorder.largest_penetration = dict(head["counters"]), head["largest_penetration"]
-        run.control.halvings, run.control.calm = head["halvings"], head["calm"]
-        run.control.proposed = head["proposed"]
+        run.ended = head["ended"]
+        for name in KEPT:
+            setattr(run.control, name, head[name])
         if head["status"] == "diverged":
             run.status, run.reason = head["status"], head["reason"]
         return True
@@ -231,7 +231,7 @@ def simulate(
     scene: Scene, *, duration: float, time_step: float, stepper: Any = "implicit_euler", contact: Any = "penalty",
     record: bool = False, wall_clock_limit: float = math.inf, progress: Callable[[float], None] | None = None,
     watch: Callable[[System, State], None] | None = None, checkpoint: str | os.PathLike[str] | None = None,
-    checkpoint_every: float = 10.0,
+    checkpoint_every: float = 10.0, longest_step: int = 1, decided: Decided | None = None,
 ) -> Trajectory:
     """Run ``scene`` for ``duration`` [s] in steps of at most ``time_step`` [s].
 
@@ -240,11 +240,17 @@ def simulate(
     checkpoint: a file that the simulation is kept in, written every ``checkpoint_every`` [s] of computing and at its
     end. If it is there already, the simulation goes on from it, and ends with the same bits as one that was never
     stopped; the time limit begins anew.
+    longest_step: time steps that one may span where nothing happens: no contact begins or ends, its forces hardly
+    change, and no drive begins or ends. A long step in which something does happen is taken back, and gone through in
+    single ones. decided: asked at every frame; it returns why the rest need not be simulated, or nothing. The
+    trajectory then ends there, with that sentence as ``ended``.
     A step that fails is halved, up to 2^-8, then the run ends with status ``diverged``; a run that takes longer than
     ``wall_clock_limit`` [s] ends with status ``timeout``. A stepper that estimates its error chooses its steps itself,
     within the same bounds; then ``time_step`` is only how often a frame is kept. Raises InputError for numbers that
     make no sense, and for a checkpoint that is damaged or belongs to another simulation.
     """
+    if longest_step < 1:
+        raise InputError(f"longest_step must be 1 or more time steps, not {longest_step}")
     for name, value in (("duration", duration), ("time_step", time_step)):
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{name} must be a positive number of seconds, not {value}")
@@ -255,7 +261,8 @@ def simulate(
     frames = max(round(duration / time_step), 1)
     run = _Run(
         system=system, stepper=stepper, duration=duration, frames=frames, recorder=_Recorder(record=record),
-        control=_StepControl(frame=duration / frames), state=system.initial_state(),
+        control=StepControl(frame=duration / frames, longest=longest_step if hasattr(system.contact, "history") else 1),
+        state=system.initial_state(), decided=decided, timetable=Timetable.of(scene),
     )
     system.shortest_step = run.control.shortest
     keeper = None
@@ -279,4 +286,4 @@ def simulate(
     if keeper is not None:
         keeper.save(run)
     timings = {"set_up": set_up, "steps": clock.perf_counter() - begun - set_up}
-    return run.recorder.trajectory(status=run.status, reason=run.reason, timings=timings)
+    return run.recorder.trajectory(status=run.status, reason=run.reason, ended=run.ended, timings=timings)

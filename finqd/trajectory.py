@@ -30,7 +30,7 @@ from finqd.errors import InputError
 from finqd.protocol import GraspProtocol
 
 FORMAT = "finqd trajectory"
-VERSION = 2
+VERSION = 3
 
 #: a rigid body's surface in its body frame: vertices [m], (n, 3), and triangles (m, 3), outward
 Surface = tuple[np.ndarray, np.ndarray]
@@ -50,7 +50,8 @@ class Trajectory:
     """What happened in a simulation: one row a frame, from the start on. SI units.
 
     status: "ok", or why there is no full result ("diverged", "timeout", "mesh_failed", ...); reason: one sentence then
-    times [s], (n_frames,)
+    ended: why the simulation was ended early, as all that it was to tell was known; nothing if it was not
+    times [s], (n_frames,), not evenly spaced where steps span several frames
     rigid_positions: centres of mass [m], (n_frames, n_rigid, 3); rigid_rotations: (n_frames, n_rigid, 3, 3)
     soft_centres: centres of mass of the soft bodies [m], (n_frames, n_soft, 3)
     contact_forces: sum of the normal forces on each soft body [N], (n_frames, n_soft)
@@ -65,6 +66,7 @@ class Trajectory:
 
     status: str
     reason: str = ""
+    ended: str = ""
     object_name: str = ""
     object_drop: float = math.nan
     times: np.ndarray = _empty(0)

@@ -133,13 +133,14 @@ def test_an_iteration_begins_with_the_projected_matrix_after_one_that_needed_it(
     class Well(Newton):
         def _solve(self) -> Any:
             curvature = derivatives.curvature
-            return SimpleNamespace(soft=-derivatives.soft / curvature, rigid=np.zeros(0), definite=curvature > 0.0)
+            soft, positive = -derivatives.soft / curvature, curvature > 0.0
+                return SimpleNamespace(soft=soft, rigid=np.zeros(0), definite=positive, bent=False)
 
     def gradient(at: SimpleNamespace) -> float:
         derivatives.soft = np.array([at.x**3 - at.x])
         return float(at.x**4 / 4 - at.x**2 / 2)
 
-    def hessian(at: SimpleNamespace, *, projected: bool) -> None:
+    def hessian(at: SimpleNamespace, *, projected: bool, contact_projected: bool) -> None:
         tried.append(projected)
         exact = 3.0 * at.x**2 - 1.0
         derivatives.curvature = abs(exact) if projected else exact

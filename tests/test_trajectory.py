@@ -137,7 +137,7 @@ def header(**entries) -> np.ndarray:
         (foreign(x=np.zeros(3)), "not a finqd trajectory"),
         (foreign(header=header(format="other", version=1)), "not a finqd trajectory"),
         (foreign(header=header(format="finqd trajectory", version=9)), "format version 9"),
-        (foreign(header=header(format="finqd trajectory", version=2)), "another version"),
+        (foreign(header=header(format="finqd trajectory", version=3)), "another version"),
         (foreign(header=np.frombuffer(b"[1, 2]", dtype=np.uint8)), "not a finqd trajectory"),
     ],
 )

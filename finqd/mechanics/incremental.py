@@ -45,7 +45,7 @@ def euler_past(system: System, state: State, dt: float) -> Past:
     return Past(
         h=dt, origin=state.positions, inertial=state.positions + dt * state.velocities,
         rigid_origin=state.rigid_positions, rigid_inertial=state.rigid_positions + dt * state.rigid_velocities,
-        turns=_spins(system, inertias, state.angular_momenta) * dt, inertias=inertias,
+        turns=system.spins(state.rigid_rotations, state.angular_momenta) * dt, inertias=inertias,
     )
 
 
@@ -80,7 +80,7 @@ def bdf2_past(system: System, state: State, dt: float) -> Past:
         (state.velocities, before.velocities), (state.rigid_velocities, before.rigid_velocities),
         (state.angular_momenta, before.angular_momenta)))
     turns, inertias = np.zeros((system.n_rigid, 3)), np.zeros((system.n_rigid, 3, 3))
-    spins = dt * _spins(system, system.world_inertias(state.rigid_rotations), state.angular_momenta)
+    spins = dt * system.spins(state.rigid_rotations, state.angular_momenta)
     for r, (spin, now, then) in enumerate(zip(spins, state.rigid_rotations, before.rigid_rotations, strict=True)):
         left = np.linalg.inv(inverse_left_jacobian(spin))
         turned = rotation_matrix(spin) @ now
@@ -93,11 +93,20 @@ def bdf2_past(system: System, state: State, dt: float) -> Past:
     )
 
 
-def _spins(system: System, inertias: np.ndarray, momenta: np.ndarray) -> np.ndarray:
-    """Return the angular velocities [rad/s] of the rigid bodies, shape (n_rigid, 3)."""
-    if not system.n_rigid:
-        return np.zeros((0, 3))
-    return np.linalg.solve(inertias, momenta[:, :, None])[:, :, 0]
+def _between(*poses: np.ndarray) -> list[np.ndarray]:
+    """Return the (4, 4) motions from each pose to the next."""
+    return [end @ np.linalg.inv(pose) for pose, end in zip(poses, poses[1:])]
+
+
+def _unforeseen(poses: list[np.ndarray], times: tuple[float, ...], points: np.ndarray) -> np.ndarray:
+    """Return how far ``points`` (n, 3) [m] are carried by the last of three motions beyond what the others foretell.
+
+    poses: (4, 4) at four ``times`` [s]: velocities v_ and v between the first ones foretell dt (v + dt (v - v_) / dt_).
+    """
+    ways = [points @ (m[:3, :3] - np.eye(3)).T + m[:3, 3] for m in _between(*poses)]
+    spans = [end - begin for begin, end in zip(times, times[1:])]
+    earlier, last = (way / span if span > 0.0 else np.zeros_like(way) for way, span in zip(ways, spans[:2]))
+    return ways[2] - spans[2] * (last + spans[2] / spans[1] * (last - earlier))
 
 
 class Increment:
@@ -126,10 +135,11 @@ class Increment:
         self.scale = abs(system.energy(state))
 
     def predicted(self) -> State:
-        """Return where to start: going on with the last acceleration, or with the last velocity, or staying.
+        """Return where to start: carried by the drives, or going on with the last acceleration or velocity, or staying.
 
-        Driven vertices are at their targets in all of them. The first is the nearest, by one order of the step, where
-        motion is smooth; after an impact the last acceleration means nothing, and where its energy is not below that of
+        Driven vertices are at their targets in all of them. Bodies that are driven mostly move along with that, so the
+        first is the nearest; without drives it is the second, by one order of the step, where motion is smooth. After
+        an impact the last acceleration means nothing, and where its energy is not below that of
         the second, the lower one of the others is taken. As long as there is no last acceleration, gravity's is taken:
         what falls freely then is where it belongs, whatever the tolerances.
         """
@@ -145,19 +155,58 @@ class Increment:
                 start.rigid_velocities + ratio * (start.rigid_velocities - before.rigid_velocities),
                 start.angular_momenta + ratio * (start.angular_momenta - before.angular_momenta),
             ]
-        bent = self._start(*ends)
+        bent = self._carried(*ends) or self._start(*ends)
         if self.gradient(bent) < energy:  # no dearer than the energy, as the minimisation begins with it
             return bent
         still = self._driven(start)
         return still if self.energy(still) < energy else moving
 
+    def _carried(self, soft: np.ndarray, rigid: np.ndarray, momenta: np.ndarray) -> State | None:
+        """Return where bodies end that are carried by what drives them; None if nothing does.
+
+        soft, rigid, momenta: velocities and angular momenta that bodies would have without. With P the rigid motion of
+        a drive over this step, P_ over the last one and r the ratio of their lengths, a vertex of a body that touches
+        nothing ends at P (x0 + r (x0 - P_ x_)): nothing changes as seen from the drive. Bodies in touch hold each
+        other; they are carried by what the drives are mounted on, beyond what their velocities say of it.
+        """
+        system, start, before, h = self.system, self.start, self.start.previous, self.past.h
+        if before is None or not system.scene.motions:
+            return None
+        dt = start.time - before.time
+        times = (before.time - before.step, before.time, start.time, self.time)
+        ends, shifts = self.past.origin + h * soft, self.past.rigid_origin + h * rigid - start.rigid_positions
+        touched = system.contact.soft_forces > 0.0
+        for i, (body, _, motion) in enumerate(system.scene.motions):
+            span = slice(body.first_vertex, body.first_vertex + body.mesh.n_vertices)
+            here = start.positions[span]
+            if touched[system.scene.soft_bodies.index(body)]:
+                mounts = [motion.mount(time) for time in times]
+                ends[span] += _unforeseen(mounts, times, here)
+                if i == 0:
+                    shifts += _unforeseen(mounts, times, start.rigid_positions)
+                continue
+            then, now = _between(*(motion.pose(float(progress[i]), time) for progress, time in zip(
+                (before.progress, start.progress, self.progress), times[1:])))
+            own = here - before.positions[span] @ then[:3, :3].T - then[:3, 3]
+            ends[span] = (here + self.dt / dt * own) @ now[:3, :3].T + now[:3, 3]
+        spins = system.spins(start.rigid_rotations, momenta)
+        return self._towards(ends, shifts, spins)
+
     def _start(self, velocities: np.ndarray, rigid_velocities: np.ndarray, momenta: np.ndarray) -> State:
         """Return where the formula ends with these velocities, or as far on the way as contact lets it go."""
         start, system, past = self.start, self.system, self.past
-        spins = _spins(system, system.world_inertias(start.rigid_rotations), momenta)
+        spins = system.spins(start.rigid_rotations, momenta)
         shifts = past.rigid_origin + past.h * rigid_velocities - start.rigid_positions
+        return self._towards(past.origin + past.h * velocities, shifts, spins)
+
+    def _towards(self, ends: np.ndarray, shifts: np.ndarray, spins: np.ndarray) -> State:
+        """Return the state with soft vertices at ``ends`` [m], and rigid bodies shifted [m] and turned [rad/s].
+
+        As far on the way as contact lets it go.
+        """
+        start, system = self.start, self.system
         direction = Direction(
-            soft=past.origin + past.h * velocities - start.positions,
+            soft=ends - start.positions,
             rigid=np.where(system.rigid_held[:, None], 0.0, np.concatenate([shifts, self.dt * spins], axis=1)),
         )
         return self._driven(start.moved(direction, min(1.0, system.contact.step_limit(start, direction))))
@@ -210,11 +259,11 @@ class Increment:
         system.clear_held()
         return energy + self._withheld_energy(state)
 
-    def hessian(self, state: State, *, projected: bool = False) -> None:
-        """Fill the Hessian in the system's derivatives, the identity where held."""
+    def hessian(self, state: State, *, projected: bool = False, contact_projected: bool = False) -> None:
+        """Fill the Hessian in the system's derivatives, the identity where held; options: see `System.add_hessian`."""
         system, d, h = self.system, self.system.derivatives, self.past.h
         d.clear_hessian()
-        system.add_hessian(state, projected=projected)
+        system.add_hessian(state, projected=projected, contact_projected=contact_projected)
         add_diagonal(system.pattern.indptr, self.masses / h**2, d.blocks)
         if self.damping is not None:
             self.damping.add_hessian(state.positions, d.blocks, projected=projected)
@@ -243,7 +292,7 @@ class Increment:
         """Return ``trial`` as the end of the step, with its velocities and the start as its ``previous``."""
         past, held = self.past, self.system.rigid_held[:, None]
         return replace(
-            trial, time=self.time, progress=self.progress,
+            trial, time=self.time, progress=self.progress, step=self.dt,
             velocities=(trial.positions - past.origin) / past.h,
             # a held body must not inherit the rounding of its velocity
             rigid_velocities=np.where(held, 0.0, (trial.rigid_positions - past.rigid_origin) / past.h),

@@ -21,13 +21,16 @@ LAG_SHARE = 0.1  # or this share of the largest normal force on a body
 LAG_PROGRESS = 0.7  # renewing goes on while it leaves less than this share of what it left the last time
 LAG_CHANGE = 0.5  # share of the friction bounds, in sum, that may miss Coulomb's law at the end of a step
 PATIENCE = 2  # times as many renewals are granted before what they leave makes the step fail
-EARLY = 0.05  # [N] residual at which friction bounds are renewed for the first time, before the minimum is found
+EARLY = 0.05  # [N] residual at which friction bounds are renewed for the first time, before the minimum is found,
+EARLY_SHARE = 0.03  # or this share of the largest normal force on a body
 INNER = 0.1  # share of what a renewal unbalanced that Newton leaves before the next one: it will unbalance more
 RELAXATIONS = 60  # iterations of rigid bodies alone in a step, and as many more for each renewal
 LIGHT = 0.1  # [N] weight below which forces count as relative to that of the lightest free body
 FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 HALVINGS = 31  # of the Newton step, before the line search gives up
 ENOUGH = 12  # halvings after which it is content with the lowest energy so far
+STALL = 10  # iterations of Newton's that do not halve the residual, after which the step is given up,
+WORTHWHILE = 0.5  # share of the lowest residual so far that counts as progress
 NEARER = 0.3  # share of the residual by which an iteration must get on for the exact matrix to be tried again
 PROJECTED = 3  # iterations after which it is in any case: by projected ones Newton converges linearly
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
@@ -42,6 +45,7 @@ class NewtonOptions:
     tolerance_N: largest unbalanced force on any vertex or rigid body at the end of a step, at the friction bounds that
         it was solved with; the bounds of its end may leave more, by `LAG_FORCE` and `LAG_SHARE`. All that is less, in
         proportion, where a free body weighs less than `LIGHT`
+    tolerance_share: or this share of the largest normal force on a soft body, if that is more
     quasi_newton: whether directions that need no new matrix are tried first (see `finqd.mechanics.quasi_newton`)
     max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal.
         Quasi-Newton steps are not counted
@@ -53,6 +57,7 @@ class NewtonOptions:
     """
 
     tolerance_N: Annotated[float, Gt(0), Le(1)] = 5e-5
+    tolerance_share: Annotated[float, Ge(0), Le(0.01)] = 0.0
     quasi_newton: bool = True
     max_iterations: Annotated[int, Ge(1), Le(1000)] = 25
     max_friction_updates: Annotated[int, Ge(0), Le(100)] = 3
@@ -86,6 +91,23 @@ class _Renewals:
     idle: bool = False
     best: State | None = None
     best_jump: float = np.inf
+
+
+@dataclass
+class _Progress:
+    """Whether iterations between two renewals get on.
+
+    lowest: residual that the last progress led to [N]; since: iterations of Newton's that had been done then
+    """
+
+    lowest: float = np.inf
+    since: int = 0
+
+    def stalls(self, residual: float, iterations: int) -> bool:
+        """Take the ``residual`` [N] after so many ``iterations``; tell whether they have led nowhere for long."""
+        if residual <= WORTHWHILE * self.lowest:
+            self.lowest, self.since = residual, iterations
+        return iterations - self.since >= STALL
 
 
 @dataclass
@@ -124,11 +146,16 @@ class Newton:
     @property
     def tolerance(self) -> float:
         """Force that may be unbalanced at a minimum [N]."""
-        return self.scale * self.options.tolerance_N
+        return max(self.scale * self.options.tolerance_N, self.options.tolerance_share * self._pressed)
+
+    @property
+    def _pressed(self) -> float:
+        """The largest normal force on a soft body when contact was renewed last [N]."""
+        return float(np.max(self.system.contact.relagged_forces, initial=0.0))
 
     def minimise(self, trial: State) -> State:
         """Return the minimum that is found from ``trial``; it is one only if ``report.converged``."""
-        report, options, renewals = self.report, self.options, _Renewals()
+        report, options, renewals, progress = self.report, self.options, _Renewals(), _Progress()
         quasi = QuasiNewton(options.solver(self.system).lagged if options.quasi_newton else None)
         energy = self.increment.gradient(trial)
         report.residual, report.where = self.system.residual()
@@ -143,10 +170,12 @@ class Newton:
             if done or (begun and self._renewal_is_due(renewals)):
                 energy, ended = self._renew(trial, renewals, done=done)
                 quasi.renewed()
+                progress = _Progress(since=report.iterations)
                 if ended:
                     break
                 continue
-            if report.iterations >= options.max_iterations * (1 + report.friction_updates):
+            tired = report.iterations >= options.max_iterations * (1 + report.friction_updates)
+            if progress.stalls(report.residual, report.iterations) or tired:
                 left = f"{report.residual:.3g} N left on {report.where}"
                 report.reason = f"no equilibrium after {report.iterations} iterations: {left}"
                 break
@@ -167,7 +196,7 @@ class Newton:
         """Tell whether friction bounds are better renewed now, though this is no minimum yet: it will move."""
         report = self.report
         if renewals.early:
-            return report.residual <= self.scale * EARLY
+            return report.residual <= max(self.scale * EARLY, EARLY_SHARE * self._pressed)
         return report.friction_updates < self.options.max_friction_updates and report.residual <= INNER * renewals.added
 
     def _renew(self, trial: State, renewals: _Renewals, *, done: bool) -> tuple[float, bool]:
@@ -203,7 +232,7 @@ class Newton:
 
     def _bound(self) -> float:
         """Return what renewed contact may leave unbalanced at the end of a step [N]."""
-        return max(self.scale * LAG_FORCE, LAG_SHARE * float(np.max(self.system.contact.relagged_forces, initial=0.0)))
+        return max(self.scale * LAG_FORCE, LAG_SHARE * self._pressed)
 
     def _relax(self, trial: State, energy: float, renewals: _Renewals) -> tuple[State, float] | None:
         """Bring rigid bodies that touch nothing soft to rest while all else stays; None if that leads nowhere."""
@@ -274,11 +303,12 @@ class Newton:
                 self.increment.gradient(trial)
             convexity.lost = projected
             report.projections += int(projected)
-            self.increment.hessian(trial, projected=projected)
+            # contact's own curvature jumps wherever a point comes to an edge: with it there are a fifth more iterations
+            self.increment.hessian(trial, projected=projected, contact_projected=True)
             solution = self._solve()
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
             slope = self._slope(direction)
-            if solution.definite and slope < 0.0:
+            if (solution.definite or solution.bent) and slope < 0.0:
                 moved = self._search(trial, energy, direction, slope)
                 if moved is not None:
                     return moved

@@ -30,6 +30,7 @@ class State:
     rigid_rotations: body frame to world, shape (n_rigid, 3, 3)
     angular_momenta: about the centres of mass, world frame [kg m^2/s], shape (n_rigid, 3)
     progress: share of its time that each driven motion has run, shape (n_motions,), in [0, 1]
+    step: length of the step that led here [s], 0 at the start
     previous: the state one step earlier, where a stepper needs it (that one without a ``previous`` of its own)
     """
 
@@ -41,6 +42,7 @@ class State:
     rigid_velocities: np.ndarray
     angular_momenta: np.ndarray
     progress: np.ndarray
+    step: float = 0.0
     previous: State | None = None
 
     def moved(self, direction: Direction, share: float = 1.0) -> State:

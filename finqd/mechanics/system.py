@@ -170,6 +170,12 @@ class System:
         """Return the rigid bodies' inertias [kg m^2] in the world frame, shape (n_rigid, 3, 3)."""
         return rotations @ self.rigid_inertias @ rotations.transpose(0, 2, 1)
 
+    def spins(self, rotations: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+        """Return the angular velocities [rad/s] of rigid bodies from their angular ``momenta`` (n_rigid, 3)."""
+        if not self.n_rigid:
+            return np.zeros((0, 3))
+        return np.linalg.solve(self.world_inertias(rotations), momenta[:, :, None])[:, :, 0]
+
     def soft_centres(self, positions: np.ndarray) -> np.ndarray:
         """Return the centres of mass of the soft bodies [m], shape (n_soft, 3)."""
         spans = [slice(b.first_vertex, b.first_vertex + b.mesh.n_vertices) for b in self.scene.soft_bodies]
@@ -224,13 +230,16 @@ class System:
         d.soft += self._elastic
         return energy + self._elastic_energy + self.contact.add_gradient(state, d)
 
-    def add_hessian(self, state: State, *, projected: bool = False) -> None:
-        """Add the Hessian of `energy` to `derivatives`, cleared before; ``projected``: a positive semidefinite one."""
+    def add_hessian(self, state: State, *, projected: bool = False, contact_projected: bool = False) -> None:
+        """Add the Hessian of `energy` to `derivatives`, cleared before; ``projected``: a positive semidefinite one.
+
+        contact_projected: that of contact is, in any case.
+        """
         d = self.derivatives
         self.find_couplings(state)
         for potential, slots in zip(self.potentials, self.slots, strict=True):
             potential.add_hessian(state.positions, slots, d.blocks, projected=projected)
-        self.contact.add_hessian(state, d, projected=projected)
+        self.contact.add_hessian(state, d, projected=projected or contact_projected)
 
     def find_couplings(self, state: State) -> None:
         """Make room in the soft Hessian for all that contact couples at ``state``; an empty one takes its place."""
