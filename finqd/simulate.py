@@ -7,7 +7,7 @@ import os
 import time as clock
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -267,7 +267,10 @@ def simulate(
     system.shortest_step = run.control.shortest
     keeper = None
     if checkpoint is not None:
-        named = fingerprint(scene, duration=duration, frames=frames, record=record, stepper=stepper, contact=contact)
+        named = fingerprint(
+            scene, duration=duration, frames=frames, record=record, stepper=stepper, contact=contact,
+            longest_step=longest_step, decided=decided if is_dataclass(decided) else decided is not None,
+        )
         keeper = _Keeper(path=Path(checkpoint), fingerprint=named, every=checkpoint_every)
     if keeper is None or not keeper.restore(run):
         run.start()

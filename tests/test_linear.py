@@ -370,3 +370,40 @@ def test_rows_hold_one_triangle_of_the_matrix(part):
     rows.fill(system.blocks)
     expected = {"lower": np.tril, "upper": np.triu, "full": np.asarray}[part](system.dense)
     np.testing.assert_array_equal(rows.as_columns().toarray().T, expected)
+
+
+@pytest.mark.parametrize("backend", available_backends())
+def test_what_only_rigid_bodies_make_indefinite_is_bent_to_a_downhill_solution(backend):
+    """The soft part stays exact, of the Schur complement the negative eigenvalues lose their sign."""
+    system = System(3)
+    size = len(system.coupling)
+    least = np.linalg.eigvalsh(schur(system))[0]
+    system.rigid -= (least + 1.0) * np.eye(6)
+    values, vectors = np.linalg.eigh(schur(system))
+    assert values[0] < 0.0 < values[-1], "or this says nothing"
+    solution = system.solve(make_solver(system.pattern, backend=backend))
+    assert solution.bent and not solution.definite and not solution.converged
+    scale = np.diag(1.0 / np.sqrt(np.abs(np.diag(schur(system)))))  # metres and radians differ
+    values, vectors = np.linalg.eigh(scale @ schur(system) @ scale)
+    back = np.linalg.inv(scale) @ vectors
+    bent = system.dense
+    bent[size:, size:] += back @ np.diag(np.abs(values) - values) @ back.T
+    rhs = np.concatenate([system.rhs_soft.reshape(-1), system.rhs_rigid])
+    found = np.concatenate([solution.soft.reshape(-1), solution.rigid.reshape(-1)])
+    assert float(rhs @ found) > 0.0, "downhill: rhs is minus the gradient"
+    assert float(rhs @ system.exact) < float(rhs @ found)
+    np.testing.assert_allclose(found, np.linalg.solve(bent, rhs), rtol=1e-3, atol=1e-3 * np.abs(found).max())
+
+
+@pytest.mark.parametrize("backend", available_backends())
+def test_what_the_soft_part_makes_indefinite_is_not_bent(backend):
+    system = System(3, shift=200.0)
+    solution = system.solve(make_solver(system.pattern, backend=backend))
+    assert not solution.bent and not solution.definite
+
+
+def schur(system: System) -> np.ndarray:
+    """Return C - B^T A^-1 B."""
+    size = len(system.coupling)
+    dense = system.dense
+    return dense[size:, size:] - dense[size:, :size] @ np.linalg.solve(dense[:size, :size], dense[:size, size:])
