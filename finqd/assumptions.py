@@ -51,6 +51,18 @@ def effects_of(design: Design) -> dict[str, str]:
     return found
 
 
+def reductions_of(design: Design) -> dict[str, str]:
+    """Return reduction -> on or off, and what it does, of a design's simulations: what is left out where nothing is."""
+    protocol = design.protocol
+    early = "on: a grasp ends where its verdict is certain; `ended` of an object says why (protocol.early_verdict)"
+    factor = protocol.calm_step_factor
+    return {
+        "early_verdict": early if protocol.early_verdict else "off: protocol.early_verdict is false",
+        "long_steps": "off: protocol.calm_step_factor is 1" if factor == 1 else
+        f"on: up to {factor} time steps at once where nothing happens; what does is gone through in single ones",
+    }
+
+
 def _damping(design: Design) -> str:
     """Return what the material's damping does, or nothing if it has none."""
     material = design.resolved()["material"]

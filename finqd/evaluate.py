@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from finqd.accuracy_bands import accuracy
-from finqd.assumptions import ASSUMPTIONS, effects_of
+from finqd.assumptions import ASSUMPTIONS, effects_of, reductions_of
 from finqd.contracts import FitnessResult
 from finqd.errors import FinqdError, InputError, MeshError
 from finqd.grasp import GraspTask, base_height, object_heights, simulate_grasp
@@ -77,6 +77,7 @@ class Evaluation:
             "features": dict(self.features),
             "objects": {name: self._row(name, trajectory) for name, trajectory in self.trajectories.items()},
             "mesh": dict(self.mesh), "timings": dict(self.timings), "effects": effects_of(self.design),
+            "reductions": reductions_of(self.design),
             "assumptions": [*ASSUMPTIONS, *self.object_assumptions, *self.design.warnings],
             "versions": dict(versions()),
         }

@@ -320,7 +320,8 @@ def test_presets_set_what_is_open_and_nothing_else(benchmark):
     fine = apply_preset(benchmark, "fine")
     assert (fine.plugin("mesher").size_mm, fine.protocol.time_step_ms) == (2.0, 10.0)
     own = {"size_mm": 3, "layers": 4, "order": 1, "notch_nodes": "middle"}
-    stepper = {"name": "implicit_euler", "tolerance_share": 1e-4}
+    stepper = {"name": "implicit_euler", "tolerance_share": 1e-4, "stall_iterations": 7,
+               "contact_curvature": True}
     explicit = benchmark.with_overrides(
         {"mesher": {"name": "swept", **own}, "stepper": stepper, "protocol.time_step_ms": 7,
          "protocol.calm_step_factor": 1})

@@ -115,10 +115,12 @@ def test_what_has_fallen_and_lies_free_is_decided_by_its_energy():
 
 def test_a_grasp_ends_early_with_the_verdict_of_the_whole():
     design = Design.from_json(designs_folder() / "benchmark.json")
-    rows = []
+    rows, said = [], []
     for early in (True, False):
         changed = {**COARSE, "protocol.early_verdict": early}
         rows.append(evaluate(design, objects=["cylinder"], preset="draft", overrides=changed).to_dict())
+        said.append(rows[-1]["reductions"]["early_verdict"][:3])
+    assert said == ["on:", "off"]
     row, whole = (result["objects"]["cylinder"] for result in rows)
     assert row["ended"] and not whole["ended"]
     assert row["simulated_s"] < whole["simulated_s"] - 0.5

@@ -66,8 +66,9 @@ def test_the_result_says_everything_and_is_json(result):
     assert list(result["objects"]) == list(OBJECTS)
     for row in result["objects"].values():
         assert row.keys() >= ROW and row["status"] == "ok" and row["reason"] == ""
-        assert row["newton_iterations"] >= row["steps"] > 20
+        assert row["newton_iterations"] + row["counters"]["quasi_iterations"] >= row["steps"] > 10
     assert result["mesh"]["elements"]["hex20"] > 100 and result["mesh"]["dofs"] == 3 * result["mesh"]["vertices"]
+    assert result["reductions"].keys() == {"early_verdict", "long_steps"}
     assert result["effects"] == EFFECTS and len(set(result["assumptions"])) == len(result["assumptions"]) > 5
     assert result["versions"].keys() >= {"finqd", "numpy", "numba", "gmsh"}
     assert Design.from_json(json.dumps(result["design"])).digest() == result["digest"], "a result can be run again"

@@ -19,7 +19,8 @@ from finqd.mesh_shapes import box_mesh
 from finqd.objects import load_object
 from finqd.plugins.stepper_implicit_euler import ImplicitEuler
 from finqd.scene import Motion, Scene, Shift, Timed, Turn, eased
-from finqd.simulate import HALVINGS, simulate
+from finqd.simulate import simulate
+from finqd.step_control import HALVINGS
 from finqd.units import MM
 from finqd.verification import dynamics, friction
 from finqd.verification.cases import checked

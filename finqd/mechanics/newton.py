@@ -29,7 +29,6 @@ LIGHT = 0.1  # [N] weight below which forces count as relative to that of the li
 FIRST = 1e-3  # share of the tolerance that ends a step without an iteration
 HALVINGS = 31  # of the Newton step, before the line search gives up
 ENOUGH = 12  # halvings after which it is content with the lowest energy so far
-STALL = 10  # iterations of Newton's that do not halve the residual, after which the step is given up,
 WORTHWHILE = 0.5  # share of the lowest residual so far that counts as progress
 NEARER = 0.3  # share of the residual by which an iteration must get on for the exact matrix to be tried again
 PROJECTED = 3  # iterations after which it is in any case: by projected ones Newton converges linearly
@@ -49,6 +48,9 @@ class NewtonOptions:
     quasi_newton: whether directions that need no new matrix are tried first (see `finqd.mechanics.quasi_newton`)
     max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal.
         Quasi-Newton steps are not counted
+    stall_iterations: iterations that do not halve the residual after which a step is given up as well; None: none
+    contact_curvature: whether the matrix has what contact adds by its curvature. That jumps where points come to edges:
+        where bodies slide over edges there are a fifth fewer iterations without
     max_friction_updates: how often the friction bounds are renewed within a step
     friction_tolerance: share of the friction bounds that may change without a renewal
     linear_solver, preconditioner, backend: see `finqd.mechanics.linear`
@@ -60,6 +62,8 @@ class NewtonOptions:
     tolerance_share: Annotated[float, Ge(0), Le(0.01)] = 0.0
     quasi_newton: bool = True
     max_iterations: Annotated[int, Ge(1), Le(1000)] = 25
+    stall_iterations: Annotated[int, Ge(2), Le(1000)] | None = None
+    contact_curvature: bool = True
     max_friction_updates: Annotated[int, Ge(0), Le(100)] = 3
     friction_tolerance: Annotated[float, Gt(0), Le(1)] = 0.02
     linear_solver: Literal["cg", "direct"] = "cg"
@@ -97,9 +101,11 @@ class _Renewals:
 class _Progress:
     """Whether iterations between two renewals get on.
 
-    lowest: residual that the last progress led to [N]; since: iterations of Newton's that had been done then
+    patience: iterations of Newton's that may lead nowhere
+    lowest: residual that the last progress led to [N]; since: iterations that had been done then
     """
 
+    patience: int | None
     lowest: float = np.inf
     since: int = 0
 
@@ -107,7 +113,7 @@ class _Progress:
         """Take the ``residual`` [N] after so many ``iterations``; tell whether they have led nowhere for long."""
         if residual <= WORTHWHILE * self.lowest:
             self.lowest, self.since = residual, iterations
-        return iterations - self.since >= STALL
+        return self.patience is not None and iterations - self.since >= self.patience
 
 
 @dataclass
@@ -155,7 +161,8 @@ class Newton:
 
     def minimise(self, trial: State) -> State:
         """Return the minimum that is found from ``trial``; it is one only if ``report.converged``."""
-        report, options, renewals, progress = self.report, self.options, _Renewals(), _Progress()
+        report, options, renewals = self.report, self.options, _Renewals()
+        progress = _Progress(options.stall_iterations)
         quasi = QuasiNewton(options.solver(self.system).lagged if options.quasi_newton else None)
         energy = self.increment.gradient(trial)
         report.residual, report.where = self.system.residual()
@@ -170,7 +177,7 @@ class Newton:
             if done or (begun and self._renewal_is_due(renewals)):
                 energy, ended = self._renew(trial, renewals, done=done)
                 quasi.renewed()
-                progress = _Progress(since=report.iterations)
+                progress = _Progress(options.stall_iterations, since=report.iterations)
                 if ended:
                     break
                 continue
@@ -303,8 +310,8 @@ class Newton:
                 self.increment.gradient(trial)
             convexity.lost = projected
             report.projections += int(projected)
-            # contact's own curvature jumps wherever a point comes to an edge: with it there are a fifth more iterations
-            self.increment.hessian(trial, projected=projected, contact_projected=True)
+            plain = not self.options.contact_curvature
+            self.increment.hessian(trial, projected=projected, contact_projected=plain)
             solution = self._solve()
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
             slope = self._slope(direction)
