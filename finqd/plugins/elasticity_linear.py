@@ -88,9 +88,13 @@ class LinearPotential:
     places: dict[str, tuple] = field(default_factory=dict, repr=False)  # where K goes in the scene's blocks
 
     def frame(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the base's rotation R (3, 3) and its centres now, c, and at rest, C [m]."""
+        """Return the base's rotation R (3, 3) and its centres now, c, and at rest, C [m].
+
+        Without a base R is 1, and the centres are the body's: a shift costs nothing, not even the rounding of K times it.
+        """
         if not len(self.base):
-            return np.eye(3), np.zeros(3), np.zeros(3)
+            own = positions[self.first_vertex : self.first_vertex + len(self.rest)]
+            return np.eye(3), own.mean(axis=0), self.rest.mean(axis=0)
         now, rest = positions[self.base + self.first_vertex], self.rest[self.base]
         centre, rest_centre = now.mean(axis=0), rest.mean(axis=0)
         rotation = np.empty((3, 3))
