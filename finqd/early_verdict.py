@@ -71,8 +71,10 @@ class EarlyVerdict:
         d.clear_hessian()
         system.add_hessian(state)
         system.hold_fixed()
-        zeros = np.zeros_like(d.rigid)
-        solution = self.stepper.solver(system).solve(d.blocks, d.coupling, d.rigid_matrix, np.ones_like(d.soft), zeros)
+        solver = self.stepper.solver(system)
+        solver.forget()  # only the factorisation of this very matrix tells
+        solution = solver.solve(d.blocks, d.coupling, d.rigid_matrix, np.ones_like(d.soft), np.zeros_like(d.rigid))
+        solver.forget()  # it has no inertia: no use to a step
         return bool(solution.definite)
 
     def _fallen(self, system: System, state: State, drop: float) -> bool:

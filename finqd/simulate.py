@@ -18,7 +18,7 @@ from finqd.checkpoint import Checkpoint, fingerprint
 from finqd.errors import InputError
 from finqd.mechanics.state import State, StepReport
 from finqd.mechanics.system import System
-from finqd.step_control import JUMP, Contacts, StepControl, Timetable, hasty, way_is_free
+from finqd.step_control import JUMP, StepControl, Timetable, happened, hasty, way_is_free
 from finqd.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -121,13 +121,14 @@ class _Run:
 
     def _step(self, left: float) -> None:
         dt = self.control.length(left)
-        before = self.system.contact.soft_forces
-        self.state, self.report = self.stepper.step(self.system, self.state, dt)
+        start, before = self.state, self.system.contact.soft_forces
+        self.state, self.report = self.stepper.step(self.system, start, dt)
         self._count()
         if not self.control.judge(self.report, dt):
             self.status = "diverged"
             self.reason = f"at t = {self.state.time:.4f} s, dt = {dt:.2g} s: {self.report.reason}"
-        self.control.look(self.report, Contacts(before, self.system.contact.soft_forces).change)
+        if self.report.converged and self.control.longest > 1:
+            self.control.look(self.report, happened(self.system, start, self.state, before))
 
     def _count(self) -> None:
         """Take what the last step says of itself."""
@@ -150,7 +151,7 @@ class _Run:
         kept, deepest = system.contact.history(), self.recorder.largest_penetration
         end = self.duration * (self.done + span) / self.frames
         self.state, self.report = hasty(self.stepper).step(system, start, end - start.time)
-        change = Contacts(before, system.contact.soft_forces).change if self.report.converged else 1.0
+        change = happened(system, start, self.state, before) if self.report.converged else 1.0
         if change > JUMP:
             system.contact.restore(kept)
             self.report.converged = False

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from finqd.mechanics.state import Direction
+from finqd.units import MM
 
 if TYPE_CHECKING:
     from finqd.mechanics.state import State, StepReport
@@ -24,6 +25,7 @@ SMOOTH = 10  # such iterations of a step after which longer ones are tried,
 BUSY = 24  # and after which shorter ones are
 STEADY = 0.05  # share of the contact forces that may change in a frame before longer steps are tried
 JUMP = 0.3  # share of them that may change in a step of several frames; one that changes more is taken back
+ROUGH = 0.1 * MM  # way by which a rigid body may leave a uniform motion in a frame, that counts as much as `STEADY`
 LIGHT = 0.05  # [N] contact force below which changes count as share of this
 FEW = 4  # Newton iterations that a long step is given, as many more for each renewal
 AHEAD = 1.5  # lengths of a long step that must be free of contact, at the speeds of its start, where nothing touches
@@ -73,7 +75,7 @@ class StepControl:
         return True
 
     def look(self, report: StepReport, change: float) -> None:
-        """Note how a whole step went: in its contact forces, ``change`` is the share that changed in a frame."""
+        """Note how a whole step went: ``change`` is what `happened` in a frame of it."""
         if self.longest == 1 or self.proposed is not None:
             return
         effort = NEWTON * report.iterations + report.quasi_iterations
@@ -89,20 +91,40 @@ class StepControl:
         self.span, self.quiet = 1, 0
 
 
-@dataclass(frozen=True)
-class Contacts:
-    """Normal forces on the soft bodies at the ends of a step [N], (n_soft,) each."""
+def happened(system: System, start: State, end: State, before: np.ndarray) -> float:
+    """Return how much has happened in a step, as a share of the contact forces; ``before`` [N]: those at its start."""
+    return max(force_change(before, system.contact.soft_forces), STEADY / ROUGH * unrest(system, start, end))
 
-    before: np.ndarray
-    after: np.ndarray
 
-    @property
-    def change(self) -> float:
-        """Share of the largest force that the force on any body has changed by; 1 where a body is touched anew."""
-        if np.any((self.before > 0.0) != (self.after > 0.0)):
-            return 1.0
-        size = max(float(np.max(self.before, initial=0.0)), float(np.max(self.after, initial=0.0)), LIGHT)
-        return float(np.max(np.abs(self.after - self.before), initial=0.0)) / size
+def force_change(before: np.ndarray, after: np.ndarray) -> float:
+    """Return the share of the largest normal force by which that on any soft body changes; 1 if one is touched anew.
+
+    before, after: [N], (n_soft,)
+    """
+    if np.any((before > 0.0) != (after > 0.0)):
+        return 1.0
+    size = max(float(np.max(before, initial=0.0)), float(np.max(after, initial=0.0)), LIGHT)
+    return float(np.max(np.abs(after - before), initial=0.0)) / size
+
+
+def unrest(system: System, start: State, end: State) -> float:
+    """Return how far any rigid body has left a uniform motion in a step [m], as seen from what drives are mounted on.
+
+    |v1 - v0 - (m1 - m0)| dt and the same of the angular velocities times the body's radius; m: the mount's velocities.
+    """
+    if not system.n_rigid or start.previous is None:
+        return 0.0
+    dt = end.time - start.time
+    turn = system.spins(end.rigid_rotations, end.angular_momenta) - system.spins(
+        start.rigid_rotations, start.angular_momenta)
+    change = end.rigid_velocities - start.rigid_velocities
+    motions = system.scene.motions
+    if motions:
+        poses = [motions[0][2].mount(time) for time in (start.previous.time, start.time, end.time)]
+        ways = [(b - a)[:3, 3] + start.rigid_positions @ (b - a)[:3, :3].T for a, b in zip(poses, poses[1:])]
+        change = change - (ways[1] / dt - ways[0] / (start.time - start.previous.time))
+    roughest = np.linalg.norm(change, axis=1) + np.linalg.norm(turn, axis=1) * system.rigid_sizes
+    return float(np.max(np.where(system.rigid_held, 0.0, roughest))) * dt
 
 
 @dataclass(frozen=True)

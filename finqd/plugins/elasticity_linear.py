@@ -90,7 +90,7 @@ class LinearPotential:
     def frame(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the base's rotation R (3, 3) and its centres now, c, and at rest, C [m].
 
-        Without a base R is 1, and the centres are the body's: a shift costs nothing, not even the rounding of K times it.
+        Without a base R is 1, and the centres are the body's: a shift costs nothing, not even the rounding of K u.
         """
         if not len(self.base):
             own = positions[self.first_vertex : self.first_vertex + len(self.rest)]
