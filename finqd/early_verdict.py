@@ -43,7 +43,7 @@ class EarlyVerdict:
         left = self.end - state.time
         if state.time < self.hold * (1 - 1e-9) or not left > 0.0 or not self._undriven(state):
             return ""
-        heights = object_rows(frames["rigid_positions"], frames["soft_centres"])
+        heights = object_heights(frames["rigid_positions"], frames["soft_centres"])
         drop = float(np.interp(self.lift, frames["times"], heights)) + self.rise - heights[-1]
         if abs(drop - self.threshold) < CLEAR:
             return ""
@@ -82,10 +82,10 @@ class EarlyVerdict:
         weight = float(np.linalg.norm(system.scene.gravity)) * float(np.sum(system.rigid_masses))
         if np.any(system.contact.soft_forces > 0.0) or not system.n_rigid or weight == 0.0:
             return False
-        return drop - kinetic_energy(system, state) / weight > self.threshold + CLEAR
+        return drop - system.kinetic_energy(state) / weight > self.threshold + CLEAR
 
 
-def object_rows(rigid: Sequence[Any], soft: Sequence[Any]) -> list[float]:
+def object_heights(rigid: Sequence[Any] | np.ndarray, soft: Sequence[Any] | np.ndarray) -> list[float]:
     """Return the height of a grasp's object in each frame [m]: of the rigid body, or of the last soft one."""
     return [float(places[0][2]) if len(places) else float(centres[-1][2]) for places, centres in zip(rigid, soft)]
 
@@ -96,11 +96,3 @@ def fastest(system: System, state: State) -> float:
     rigid = np.linalg.norm(state.rigid_velocities, axis=1) + turning
     soft = np.linalg.norm(state.velocities, axis=1)
     return max(float(np.max(soft, initial=0.0)), float(np.max(rigid, initial=0.0)))
-
-
-def kinetic_energy(system: System, state: State) -> float:
-    """Return the kinetic energy of all bodies [J]."""
-    energy = float(np.vdot(system.masses, np.sum(state.velocities**2, axis=1)))
-    energy += float(np.vdot(system.rigid_masses, np.sum(state.rigid_velocities**2, axis=1)))
-    spins = system.spins(state.rigid_rotations, state.angular_momenta)
-    return 0.5 * (energy + float(np.vdot(spins, state.angular_momenta)))

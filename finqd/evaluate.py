@@ -15,8 +15,9 @@ import numpy as np
 from finqd.accuracy_bands import accuracy
 from finqd.assumptions import ASSUMPTIONS, effects_of, reductions_of
 from finqd.contracts import FitnessResult
+from finqd.early_verdict import object_heights
 from finqd.errors import FinqdError, InputError, MeshError
-from finqd.grasp import GraspTask, base_height, object_heights, simulate_grasp
+from finqd.grasp import GraspTask, base_height, simulate_grasp
 from finqd.meshing import mesh_solid
 from finqd.objects import GraspObject, load_object, object_names
 from finqd.presets import apply_preset
@@ -93,7 +94,7 @@ class Evaluation:
             "max_contact_force_N": _finite(np.max(forces, initial=0.0)) if simulated else None,
             "final_contact_force_N": [float(f) for f in forces[-1]] if simulated else None,
             "max_penetration_mm": _finite(np.max(penetrations, initial=0.0) / MM) if simulated else None,
-            "final_height_mm": _finite(object_heights(trajectory)[-1] / MM) if simulated else None,
+            "final_height_mm": _finite(_final_height(trajectory) / MM) if simulated else None,
             "simulated_s": float(trajectory.times[-1]) if simulated else 0.0, "ended": trajectory.ended,
             "steps": trajectory.counters.get("steps", 0),
             "newton_iterations": trajectory.counters.get("newton_iterations", 0),
@@ -245,6 +246,10 @@ def _write_record(folder: Path, task: GraspTask, trajectory: Trajectory) -> None
     trajectory.save(target / "trajectory.npz")
     surfaces = [(body.shape.vertices, body.shape.triangles) for body in scene.rigid_bodies]
     write_paraview(target, trajectory, [body.mesh for body in scene.soft_bodies], surfaces)
+
+
+def _final_height(trajectory: Trajectory) -> float:
+    return object_heights(trajectory.rigid_positions[-1:], trajectory.soft_centres[-1:])[0]
 
 
 def _finite(value: float) -> float | None:

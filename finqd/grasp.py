@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from finqd.early_verdict import EarlyVerdict
+from finqd.early_verdict import EarlyVerdict, object_heights
 from finqd.placement import placement
 from finqd.scene import Scene, Shift, Timed
 from finqd.simulate import simulate
@@ -171,13 +171,6 @@ def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Tra
     )
 
 
-def object_heights(trajectory: Trajectory) -> np.ndarray:
-    """Return the height of a grasp's object, its centre of mass [m], (n_frames,); a soft one is the last soft body."""
-    if trajectory.rigid_positions.shape[1]:
-        return trajectory.rigid_positions[:, 0, 2]
-    return trajectory.soft_centres[:, -1, 2]
-
-
 def object_drop(trajectory: Trajectory, protocol: GraspProtocol) -> float:
     """Return how far the object fell relative to the gripper between the start of the lift and the end [m].
 
@@ -185,6 +178,6 @@ def object_drop(trajectory: Trajectory, protocol: GraspProtocol) -> float:
     """
     if trajectory.status != "ok":
         return math.nan
-    heights = object_heights(trajectory)
+    heights = object_heights(trajectory.rigid_positions, trajectory.soft_centres)
     before = float(np.interp(lift_start(protocol), trajectory.times, heights))
     return before + protocol.si("lift_mm") - float(heights[-1])

@@ -10,7 +10,7 @@ import pytest
 from finqd import registry
 from finqd.data import designs_folder
 from finqd.design import Design
-from finqd.early_verdict import CLEAR, STILL, EarlyVerdict, fastest, kinetic_energy
+from finqd.early_verdict import CLEAR, STILL, EarlyVerdict, fastest
 from finqd.evaluate import evaluate
 from finqd.mechanics.material import Material
 from finqd.mechanics.state import State
@@ -109,7 +109,7 @@ def test_what_has_fallen_and_lies_free_is_decided_by_its_energy():
     assert not verdict()(system, state, frames(system, state, drop=1.9 * THRESHOLD))
     high = np.sqrt(2 * 9.81 * 1.2 * THRESHOLD)
     thrown = replace(state, rigid_velocities=np.array([[0.0, 0.0, high]]))
-    assert kinetic_energy(system, thrown) == pytest.approx(0.02 * 9.81 * 1.2 * THRESHOLD, rel=1e-2)
+    assert system.kinetic_energy(thrown) == pytest.approx(0.02 * 9.81 * 1.2 * THRESHOLD, rel=1e-2)
     assert not verdict()(system, thrown, frames(system, state, drop=2.1 * THRESHOLD))
 
 

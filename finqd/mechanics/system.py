@@ -176,6 +176,13 @@ class System:
             return np.zeros((0, 3))
         return np.linalg.solve(self.world_inertias(rotations), momenta[:, :, None])[:, :, 0]
 
+    def kinetic_energy(self, state: State) -> float:
+        """Return the kinetic energy of all bodies [J]."""
+        energy = float(np.vdot(self.masses, np.sum(state.velocities**2, axis=1)))
+        energy += float(np.vdot(self.rigid_masses, np.sum(state.rigid_velocities**2, axis=1)))
+        spins = self.spins(state.rigid_rotations, state.angular_momenta)
+        return 0.5 * (energy + float(np.vdot(spins, state.angular_momenta)))
+
     def soft_centres(self, positions: np.ndarray) -> np.ndarray:
         """Return the centres of mass of the soft bodies [m], shape (n_soft, 3)."""
         spans = [slice(b.first_vertex, b.first_vertex + b.mesh.n_vertices) for b in self.scene.soft_bodies]

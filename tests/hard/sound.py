@@ -36,7 +36,7 @@ class Course:
     def __call__(self, system: System, state: State) -> None:
         self.system = system
         self.states.append(state)
-        self.kinetic.append(kinetic_energy(system, state))
+        self.kinetic.append(system.kinetic_energy(state))
         self.energies.append(self.kinetic[-1] + system.energy(state))
 
     def longest_way(self) -> float:
@@ -47,15 +47,6 @@ class Course:
             if places.size:
                 ways.append(float(np.linalg.norm(np.diff(places, axis=0), axis=2).sum(axis=0).max()))
         return sum(ways)
-
-
-def kinetic_energy(system: System, state: State) -> float:
-    """Return the kinetic energy of all bodies [J]."""
-    energy = 0.5 * float(np.vdot(system.masses, np.sum(state.velocities**2, axis=1)))
-    energy += 0.5 * float(np.vdot(system.rigid_masses, np.sum(state.rigid_velocities**2, axis=1)))
-    for inertia, momentum in zip(system.world_inertias(state.rigid_rotations), state.angular_momenta, strict=True):
-        energy += 0.5 * float(momentum @ np.linalg.solve(inertia, momentum))
-    return energy
 
 
 def sound(
