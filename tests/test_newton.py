@@ -133,8 +133,7 @@ def test_an_iteration_begins_with_the_projected_matrix_after_one_that_needed_it(
     class Well(Newton):
         def _solve(self) -> Any:
             curvature = derivatives.curvature
-            soft, positive = -derivatives.soft / curvature, curvature > 0.0
-            return SimpleNamespace(soft=soft, rigid=np.zeros(0), definite=positive, bent=False)
+            return SimpleNamespace(soft=-derivatives.soft / curvature, rigid=np.zeros(0), definite=curvature > 0.0)
 
     def gradient(at: SimpleNamespace) -> float:
         derivatives.soft = np.array([at.x**3 - at.x])

@@ -43,8 +43,6 @@ class LinearSolution:
     definite: False if the matrix was found to be indefinite (or singular). x and y are then the solution of the
         indefinite system if ``converged``, otherwise the last iterate before the negative curvature (zero if none)
     converged: whether the residual is within the tolerance
-    bent: True if only the rigid bodies made it indefinite, and the solution is one of a matrix in which they do not, so
-        that it is downhill (see `CoupledInverse`)
     """
 
     soft: np.ndarray
@@ -53,7 +51,6 @@ class LinearSolution:
     factorised: bool
     definite: bool
     converged: bool
-    bent: bool = False
 
 
 @dataclass
@@ -64,7 +61,6 @@ class _Iterate:
     iterations: int = 0
     converged: bool = False
     definite: bool = True
-    bent: bool = False
 
 
 def conjugate_gradients(
@@ -170,12 +166,11 @@ class LinearSolver:
             factorised=factorised,
             definite=state.definite,
             converged=state.converged and finite,
-            bent=state.bent and finite,
         )
 
     @property
     def lagged(self) -> Preconditioner | None:
-        """The exact inverse of an earlier system, positive definite (if need be, bent to that), if one is kept."""
+        """The exact inverse of an earlier system, which was positive definite, if one is kept."""
         return self._lagged
 
     def forget(self) -> None:
@@ -255,13 +250,12 @@ class LinearSolver:
         single = self._factorisation.single
         inverse = _inverse_of(self._factorisation, matrix)
         positive = inverse is not None and inverse.positive
-        served, self._served = self._served, positive or (inverse is not None and inverse.bent and not inverse.doubtful)
+        served, self._served = self._served, positive
         if inverse is None or not positive:
-            if single and not served and not self._served:
+            if single and not served:
                 return self._precise_cg(matrix, rhs, tolerance)
             if inverse is None:
                 return _Iterate(np.zeros(len(rhs)), definite=False)
-            self._lagged = inverse if inverse.bent else None
             return _solve_directly(matrix, inverse, rhs)
         self._lagged, self._spent, self._solved = inverse, 1, 1
         self._refactor_cost = self._cost_of(matrix)
@@ -304,7 +298,7 @@ def _solve_directly(matrix: CoupledMatrix, inverse: CoupledInverse, rhs: np.ndar
     diagonal = np.concatenate([np.einsum("nii->ni", soft).reshape(-1), *(np.diag(block) for block in rigid)])
     weight = 1.0 / np.where(diagonal == 0.0, 1.0, np.abs(diagonal))
     left, given = dot(weight * residual, residual), dot(weight * rhs, rhs)
-    return _Iterate(x, 1, left <= _DIRECT_TOLERANCE**2 * given, inverse.positive, inverse.bent)
+    return _Iterate(x, 1, left <= _DIRECT_TOLERANCE**2 * given, inverse.positive)
 
 
 def make_solver(

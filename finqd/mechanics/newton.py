@@ -315,7 +315,7 @@ class Newton:
             solution = self._solve()
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
             slope = self._slope(direction)
-            if (solution.definite or solution.bent) and slope < 0.0:
+            if solution.definite and slope < 0.0:
                 moved = self._search(trial, energy, direction, slope)
                 if moved is not None:
                     return moved

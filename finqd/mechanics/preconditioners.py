@@ -22,8 +22,6 @@ from finqd.mechanics.pattern import BlockPattern
 
 #: smallest eigenvalue of a scaled Schur complement, as a share of the largest, that is told from zero
 _SINGULAR = 1e-14
-#: negative share of the largest above which an eigenvalue may be one for rounding in single precision
-_DOUBTFUL = 1e-2
 
 
 @dataclass(frozen=True)
@@ -67,10 +65,6 @@ class CoupledInverse:
 
     With W = A^-1 B and the Schur complement S = C - B^T W: y = S^-1 (s - W^T r), x = A^-1 r - W y. The inertias
     of A and of S add up to that of the whole matrix (Haynsworth 1968), so both tell whether it is positive definite.
-
-    positive: whether it is; bent: whether only S is indefinite. Then |S| takes its place (the same eigenvectors,
-    eigenvalues without their signs), so that what `apply` returns is downhill even so (Dauphin et al., Identifying and
-    attacking the saddle point problem, 2014). doubtful: whether that may be an error of rounding in single precision
     """
 
     def __init__(self, factorisation: Factorisation, matrix: CoupledMatrix) -> None:
@@ -81,14 +75,12 @@ class CoupledInverse:
         self._size = len(matrix.coupling)
         self._eliminated = np.zeros(matrix.coupling.shape)
         self._schur_inverse = np.zeros((0, 0))
-        self.bent = self.doubtful = False
         if matrix.coupling.shape[1]:
             if len(matrix.coupling):
                 self._eliminated = np.ascontiguousarray(factorisation.solve(matrix.coupling))
             schur = matrix.rigid - matrix.coupling.T @ self._eliminated
-            self._schur_inverse, least = _positive_inverse(0.5 * (schur + schur.T))
-            self.bent, self.doubtful = self.positive and least < 0.0, self.positive and -_DOUBTFUL < least < 0.0
-            self.positive = self.positive and least > 0.0
+            self._schur_inverse, definite = _symmetric_inverse(0.5 * (schur + schur.T))
+            self.positive = self.positive and definite
 
     @classmethod
     def restored(
@@ -97,7 +89,6 @@ class CoupledInverse:
         """Return an inverse from its parts; the matrix of ``factorisation`` has been factorised."""
         inverse = cls.__new__(cls)
         inverse._factorisation, inverse.positive, inverse._size = factorisation, True, len(eliminated)
-        inverse.bent = inverse.doubtful = False
         inverse._eliminated, inverse._schur_inverse = eliminated, schur_inverse
         return inverse
 
@@ -126,8 +117,8 @@ class CoupledInverse:
         return result
 
 
-def _positive_inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the inverse of |M|, M small and symmetric, and M's smallest eigenvalue as a share of the largest in size.
+def _symmetric_inverse(matrix: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the inverse of a small symmetric matrix and whether it is positive definite.
 
     Rows are scaled by the diagonal first: metres and radians differ by orders of magnitude. Raises
     ``numpy.linalg.LinAlgError`` if it is singular.
@@ -135,11 +126,10 @@ def _positive_inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
     diagonal = np.abs(np.diag(matrix))
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale[None, :])
-    sizes = np.abs(values)
-    if not np.all(sizes > _SINGULAR * np.max(sizes)):
+    if not np.all(np.abs(values) > _SINGULAR * np.max(np.abs(values))):
         raise np.linalg.LinAlgError("the Schur complement of the rigid bodies is singular")
     vectors = scale[:, None] * vectors
-    return (vectors / sizes) @ vectors.T, float(values[0] / np.max(sizes))
+    return (vectors / values) @ vectors.T, bool(np.all(values > 0.0))
 
 
 class Jacobi:
