@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from finqd.accuracy_cases import Case, Measure, expected_seconds, measured
-from finqd.accuracy_ladder import Rung, build_ladder, options_text, reference_rungs
+from finqd.accuracy_ladder import NUMERICAL_CONSTANTS, Rung, build_ladder, options_text, reference_rungs
 from finqd.accuracy_machine import describe_machine
 from finqd.accuracy_reference import Reference, error_of, make_reference, shipped_reference
 from finqd.errors import InputError
@@ -193,8 +193,7 @@ class Study:
         # a constant of zero is left out: what a later version adds to the material, and is off, changes no value
         known["material"] = {key: value for key, value in known["material"].items() if value != 0}
         if "protocol" in known:
-            skipped = ("time_step_ms", "wall_clock_limit_s")
-            known["protocol"] = {k: v for k, v in known["protocol"].items() if k not in skipped}
+            known["protocol"] = {k: v for k, v in known["protocol"].items() if k not in NUMERICAL_CONSTANTS}
         if self.case.fingers == 1:
             known["finger"] = dict(self.design.fingers[self.options["finger"]])
             text = json.dumps([self.case.name, known], sort_keys=True)

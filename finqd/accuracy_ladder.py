@@ -30,7 +30,8 @@ TRADES = ("preset", "size", "element", "step", "adaptive")
 NUMERICS = ("mesher", "stepper", "contact")
 AS_GIVEN = "as given"
 STEP = "protocol.time_step_ms"
-NUMERICAL_CONSTANTS = ("time_step_ms", "wall_clock_limit_s")
+#: of the protocol, that decide how exact a result is and not what is simulated
+NUMERICAL_CONSTANTS = ("time_step_ms", "calm_step_factor", "early_verdict", "wall_clock_limit_s")
 
 _TET4: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 1}
 _TET10: dict[str, Any] = {"mesher": "tetrahedral", "mesher.order": 2}
@@ -231,7 +232,8 @@ def _steppers() -> list[Rung]:
 
 def _newton() -> list[Rung]:
     return [
-        _rung("newton", "Newton tolerance", f"tolerance {force:g} N", {"stepper.tolerance_N": force})
+        _rung("newton", "Newton tolerance", f"tolerance {force:g} N",
+              {"stepper.tolerance_N": force, "stepper.tolerance_share": 0.0})
         for force in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
     ] + [
         _rung("newton", "friction tolerance", f"friction tolerance {share:g}", {"stepper.friction_tolerance": share})

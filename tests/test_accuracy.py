@@ -44,7 +44,7 @@ from finqd.accuracy_reference import (
     write_reference,
 )
 from finqd.accuracy_report import csv_text, page, richardson, write_report
-from finqd.data import studies_folder
+from finqd.data import designs_folder, studies_folder
 from finqd.design import Design, parse_setting
 from finqd.errors import InputError
 from finqd.presets import PRESETS, apply_preset
@@ -644,3 +644,14 @@ def test_options_are_written_as_a_shell_takes_them():
     assert options_text("draft", {}) == "--preset draft"
     text = options_text("standard", {"stepper.tolerance_N": 1e-6})
     assert text == "--preset standard --set stepper.tolerance_N=1e-06"
+
+
+def test_what_presets_set_of_the_protocol_is_no_part_of_what_is_studied():
+    """A ladder's rungs have the steps of their own preset; a tolerance is what a rung says, not the preset."""
+    design = Design.from_json(designs_folder() / "benchmark.json")
+    changed = {"protocol.calm_step_factor": 2, "protocol.early_verdict": False, "protocol.time_step_ms": 7}
+    bare = without_numerics(design.with_overrides({**changed, "protocol.hold_s": 3.0}))
+    assert bare.to_dict()["protocol"] == {"hold_s": 3.0}
+    tolerances = [rung.settings for rung in build_ladder(design, knobs=["newton"]).rungs
+                  if "stepper.tolerance_N" in rung.settings]
+    assert tolerances and all(settings["stepper.tolerance_share"] == 0.0 for settings in tolerances)
