@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from finqd.scene import Scene
 
 FORMAT = "finqd checkpoint"
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,9 +102,10 @@ def fingerprint(scene: Scene, **settings: Any) -> str:
     """
     digest = hashlib.sha256()
     friction = {tuple(sorted(pair)): value for pair, value in scene.pair_friction.items()}
+    ignored = sorted(tuple(sorted(pair)) for pair in scene.ignored)
     parts = (
-        versions(), scene.gravity, scene.friction, friction, scene.soft_bodies, scene.rigid_bodies, scene.planes,
-        settings,
+        versions(), scene.gravity, scene.friction, friction, ignored, scene.soft_bodies, scene.rigid_bodies,
+        scene.planes, settings,
     )
     for piece in _pieces(parts):
         digest.update(piece)

@@ -137,6 +137,7 @@ class SoftBody:
     velocities: np.ndarray  # at the start [m/s], (n_vertices, 3)
     start_positions: np.ndarray  # at the start [m], (n_vertices, 3): the rest positions unless set
     extra_masses: np.ndarray  # beside the material's own [kg], (n_vertices,): inertia and weight, no stiffness
+    weightless: bool = False  # gravity does not act on it; its inertia stays
     drives: list[tuple[np.ndarray, Motion]] = field(default_factory=list)
 
     def vertices(self, where: str | np.ndarray) -> np.ndarray:
@@ -213,6 +214,7 @@ class Scene:
         self.rigid_bodies: list[RigidBody] = []
         self.planes: list[Plane] = []
         self.pair_friction: dict[frozenset[str], float] = {}
+        self.ignored: set[frozenset[str]] = set()
 
     def add_soft(
         self, mesh: Mesh, material: Material, *, elasticity: Any = "corotated", name: str = "",
@@ -270,9 +272,7 @@ class Scene:
 
     def set_friction(self, a: str, b: str, coefficient: float) -> None:
         """Set Coulomb's coefficient between two bodies (or a body and a plane), by name."""
-        for name in (a, b):
-            if name not in self.names:
-                raise InputError(f"no body is called {name!r}; there are {sorted(self.names)}")
+        self._require(a, b)
         if not 0.0 <= coefficient < math.inf:
             raise InputError(f"a friction coefficient must be at least 0, not {coefficient}")
         self.pair_friction[frozenset((a, b))] = float(coefficient)
@@ -280,6 +280,15 @@ class Scene:
     def friction_between(self, a: str, b: str) -> float:
         """Return Coulomb's coefficient of a pair."""
         return self.pair_friction.get(frozenset((a, b)), self.friction)
+
+    def ignore(self, a: str, b: str) -> None:
+        """Let two bodies (or a body and a plane) pass through each other; the same name twice: a body's own faces."""
+        self._require(a, b)
+        self.ignored.add(frozenset((a, b)))
+
+    def touches(self, a: str, b: str) -> bool:
+        """Tell whether two bodies can touch, or the faces of one if it is named twice."""
+        return frozenset((a, b)) not in self.ignored
 
     @property
     def names(self) -> set[str]:
@@ -296,6 +305,11 @@ class Scene:
     def motions(self) -> list[tuple[SoftBody, np.ndarray, Motion]]:
         """All drives, in the order of `State.progress`."""
         return [(body, nodes, motion) for body in self.soft_bodies for nodes, motion in body.drives]
+
+    def _require(self, *names: str) -> None:
+        for name in names:
+            if name not in self.names:
+                raise InputError(f"no body is called {name!r}; there are {sorted(self.names)}")
 
     def _new_name(self, name: str) -> str:
         if name in self.names:

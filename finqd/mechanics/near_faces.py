@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -102,7 +102,11 @@ class NearFaces:
     the thinnest wall), never touch each other.
     """
 
-    def __init__(self, bodies: Sequence[SoftBody], surface: ContactSurface, *, gap: float) -> None:
+    def __init__(
+        self, bodies: Sequence[SoftBody], surface: ContactSurface, *, gap: float,
+        touches: Callable[[str, str], bool] = lambda one, other: True,
+    ) -> None:
+        """touches: which bodies can touch, by their names, the same twice for the faces of one."""
         self.gap, self.margin = gap, MARGIN * gap
         self.surface, self.faces, self.triangles = surface, surface.faces, Triangulation.of(surface.faces)
         self.spans = np.array([(body.first_vertex, body.first_vertex + body.mesh.n_vertices) for body in bodies])
@@ -110,6 +114,8 @@ class NearFaces:
         self.watches: list[_Watch] = []
         for i in range(len(bodies)):
             for j in range(i, len(bodies)):
+                if not touches(bodies[i].name, bodies[j].name):
+                    continue
                 one, other = mine[i], mine[j] if j > i else mine[i][:0]
                 ids, side = np.concatenate([one, other]), np.repeat([0, 1], [len(one), len(other)])
                 self.watches.append(_Watch(len(self.watches), (i, j), ids, side))
@@ -157,6 +163,10 @@ class NearFaces:
                 return found[near], gaps[near]
             self._room = 2 * count
             found, gaps = np.zeros((self._room, 2), dtype=np.int64), np.zeros(self._room)
+
+    def has_near(self, one: int, other: int) -> bool:
+        """Tell whether faces of these two bodies have been within the gap and the margin of each other."""
+        return any(len(watch.listed) > 0 for watch in self.watches if watch.bodies == (one, other))
 
     def at(self, positions: np.ndarray) -> np.ndarray:
         """Return pairs (n, 2), lower id first, ascending, with all that are nearer than the gap at ``positions``."""

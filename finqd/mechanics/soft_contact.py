@@ -89,7 +89,7 @@ class SoftContact:
     def __init__(self, scene: Scene, surface: ContactSurface, *, gap: float, pressure: float, ratio: float) -> None:
         self.surface, self.gap, self.pressure, self.ratio = surface, gap, pressure, ratio
         bodies = scene.soft_bodies
-        self.near = NearFaces(bodies, surface, gap=gap)
+        self.near = NearFaces(bodies, surface, gap=gap, touches=scene.touches)
         self.triangles = self.near.triangles
         self.points = np.zeros(0, dtype=np.int64)  # of each sample in touch, the row with the largest force,
         self.loads = np.zeros(0)  # and the force of all its rows [N]

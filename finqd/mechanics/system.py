@@ -69,7 +69,8 @@ class System:
 
         own = [lumped_masses(b.mesh, b.material.density) for b in soft]
         self.masses = stacked([mass + b.extra_masses for mass, b in zip(own, soft, strict=True)])
-        self.forces = stacked([b.loads for b in soft], 3) + self.masses[:, None] * scene.gravity
+        heavy = stacked([np.full(b.mesh.n_vertices, not b.weightless) for b in soft])
+        self.forces = stacked([b.loads for b in soft], 3) + (self.masses * heavy)[:, None] * scene.gravity
         self.fixed = stacked([b.fixed for b in soft], 3).astype(bool)
         self.rigid_masses = np.array([b.shape.mass for b in rigid])
         self.rigid_inertias = np.array([b.shape.inertia for b in rigid]).reshape(m, 3, 3)

@@ -60,8 +60,12 @@ class Ipc:
     def potential(self, scene: Scene) -> IpcContact:
         """Return the potential of every pair in ``scene`` that can touch.
 
-        Raises InputError if two bodies intersect at the start, MissingLibraryError without the package ipctk.
+        Raises InputError if two bodies intersect at the start, and for bodies that are to pass through each other,
+        MissingLibraryError without the package ipctk.
         """
+        if scene.ignored:
+            names = " and ".join(sorted(min(sorted(pair) for pair in scene.ignored)))
+            raise InputError("nothing passes through anything with the contact ipc", names)
         return IpcContact(self, scene)
 
 

@@ -16,6 +16,7 @@ from finqd.mechanics.contact_rows import FrictionBounds, FrictionRows, KeyedValu
 from finqd.mechanics.contact_surface import ContactSurface, Sight, contact_surface
 from finqd.mechanics.mass_properties import thickness
 from finqd.mechanics.pattern import BlockPattern
+from finqd.mechanics.reach import Reach, met_by_soft
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
 from finqd.mechanics.rounding import rounded_field
 from finqd.mechanics.soft_contact import SoftContact
@@ -89,16 +90,23 @@ class PenaltyContact:
         self.options, self.scene = options, scene
         self.stiffness = options.stiffness_N_mm3 / MM**3
         shapes = [body.shape for body in scene.rigid_bodies]
-        self.surface = self._surface(shapes)
+        #: rigid bodies and planes that soft ones touch
+        self.met = [r for r, body in enumerate(scene.rigid_bodies) if met_by_soft(scene, body)]
+        self.planes = [p for p, plane in enumerate(scene.planes) if met_by_soft(scene, plane)]
+        self.surface = self._surface([shapes[r] for r in self.met])
         touching = len(self.surface.faces) > 0
-        self.fields = [rounded_field(s, options.edge_radius_mm * MM) if touching else s.distance for s in shapes]
+        radius = options.edge_radius_mm * MM
+        self.fields = [
+            rounded_field(s, radius) if touching and r in self.met else s.distance for r, s in enumerate(shapes)
+        ]
         # under weightless conditions a body still must not sink into a plane: 1 g stands in for gravity
         weight = max(float(np.linalg.norm(scene.gravity)), 9.81)
         self.support_stiffness = [
             max(s.mass * weight / (options.weight_penetration_mm * MM), self.stiffness * SUPPORT_AREA) for s in shapes
         ]
         n_vertices = sum(body.mesh.n_vertices for body in scene.soft_bodies)
-        self.sights = [Sight(self.surface, n_vertices) for _ in shapes]
+        self.sights = {r: Sight(self.surface, n_vertices) for r in self.met}
+        self.reach = Reach(scene, self.surface.faces)
         self.soft = self._soft_contact()
         self._lay_out_keys()
         self.rows = Rows(256, self.surface.faces.shape[1])
@@ -124,7 +132,9 @@ class PenaltyContact:
     def _soft_contact(self) -> SoftContact | None:
         """Return the contact of soft faces with each other, None if there is none."""
         options, areas = self.options, self.surface.face_area
-        if not options.soft_contact or not len(areas):
+        names = [body.name for body in self.scene.soft_bodies]
+        none = all(not self.scene.touches(a, b) for i, a in enumerate(names) for b in names[i:])
+        if not options.soft_contact or not len(areas) or none:
             return None
         gap = min(options.soft_gap_mm * MM, FACE_SHARE * math.sqrt(float(np.median(areas))))
         spacing = options.sample_spacing_mm * MM
@@ -259,7 +269,7 @@ class PenaltyContact:
         farthest = float(np.sqrt(np.max(np.sum(direction.soft**2, axis=1), initial=0.0)))
         for r, body in enumerate(self.scene.rigid_bodies):
             shift, turn = np.linalg.norm(direction.rigid[r, :3]), np.linalg.norm(direction.rigid[r, 3:])
-            if farthest + shift + turn * body.shape.bounding_radius <= allowance:
+            if r not in self.met or farthest + shift + turn * body.shape.bounding_radius <= allowance:
                 continue
             limit = min(
                 limit,
@@ -268,10 +278,13 @@ class PenaltyContact:
                     float(body.shape.bounding_radius), direction.rigid[r, :3], direction.rigid[r, 3:], allowance,
                 ),
             )
-        for plane in self.scene.planes:
-            heights = (state.positions - plane.point) @ plane.normal
-            limit = min(limit, kernels.plane_step_limit(heights, -direction.soft @ plane.normal, allowance))
+        for p, plane in enumerate(self.scene.planes):
+            if p in self.planes:
+                heights = (state.positions - plane.point) @ plane.normal
+                limit = min(limit, kernels.plane_step_limit(heights, -direction.soft @ plane.normal, allowance))
             for r, body in enumerate(self.scene.rigid_bodies):
+                if not self.scene.touches(body.name, plane.name):
+                    continue
                 arms = _support_arms(body.shape, state.rigid_rotations[r], plane.normal)
                 moves = direction.rigid[r, :3] + np.cross(direction.rigid[r, 3:], arms)
                 heights = (state.rigid_positions[r] + arms - plane.point) @ plane.normal
@@ -297,6 +310,7 @@ class PenaltyContact:
         rows = self.rows
         self.soft_forces = self._forces_by_body(rows.forces(self.options.smoothing_mm * MM))
         self.penetration = float(np.max(-rows.gap[: rows.count], initial=0.0))
+        self.reach.look(state, self.soft)
 
     def history(self) -> dict[str, np.ndarray]:
         """Return what later steps depend on: elastic slips by key, forces and penetration of the last commit."""
@@ -304,12 +318,14 @@ class PenaltyContact:
             "slip_keys": self.slips.keys, "slips": self.slips.values, "soft_forces": self.soft_forces,
             "penetration": np.array(self.penetration),
             "coupled": np.zeros(0, dtype=np.int64) if self.soft is None else self.soft.coupled,
+            "met": self.reach.times.copy(),
         }
 
     def restore(self, history: dict[str, np.ndarray]) -> None:
         """Go on with a `history`."""
         self.slips = KeyedValues(keys=history["slip_keys"], values=history["slips"])
         self.soft_forces, self.penetration = history["soft_forces"], float(history["penetration"])
+        self.reach.times = history["met"].copy()
         if self.soft is not None:
             self.soft.restore(history["coupled"], self.pattern)
 
@@ -373,16 +389,20 @@ class PenaltyContact:
         count = 0
         for r, body in enumerate(scene.rigid_bodies):
             pose = _pose(state, r)
-            count = kernels.find_soft_rigid(
-                state.positions, *samples, *pose, self.fields[r], float(body.shape.bounding_radius),
-                *self.sights[r].arrays, r, self.first_key["rigid", r], *rows.arrays, count,
-            )
+            if r in self.met and self.reach.any_near_rigid(state, r):
+                count = kernels.find_soft_rigid(
+                    state.positions, *samples, *pose, self.fields[r], float(body.shape.bounding_radius),
+                    *self.sights[r].arrays, r, self.first_key["rigid", r], *rows.arrays, count,
+                )
             for p, plane in enumerate(scene.planes):
+                if not scene.touches(body.name, plane.name):
+                    continue
                 count = kernels.find_rigid_plane(
                     body.shape.support_points, float(body.shape.ball_radius), *pose, plane.point, plane.normal,
                     self.support_stiffness[r], r, self.first_key["support", r, p], *rows.arrays, count,
                 )
-        for p, plane in enumerate(scene.planes):
+        for p in self.planes:
+            plane = scene.planes[p]
             count = kernels.find_soft_plane(
                 state.positions, *samples, plane.point, plane.normal, self.first_key["plane", p], *rows.arrays, count,
             )
