@@ -116,6 +116,35 @@ def evaluate(
 
 
 @finqd.command()
+@click.argument("design")
+@_objects_option
+@click.option("--what-if", is_flag=True,
+              help="Simulate again with each effect the other way round, and say what that changes.")
+@click.option("--out", type=click.Path(path_type=Path), help="Write the tables to this JSON file.")
+@_jobs_option
+@_preset_option
+@_set_option
+def explain(
+    design: str, object_names: tuple[str, ...], what_if: bool, out: Path | None, jobs: int, preset: str,
+    settings: tuple[str, ...],
+) -> None:
+    """Say which effects the grasps of a gripper call for, since when, and why."""
+    from finqd.cli_files import written_at_end
+    from finqd.cli_progress import shown_progress
+    from finqd.cli_tables import print_explanation
+
+    chosen, objects = _read_design(design, settings, preset), _split(object_names) or None
+    with written_at_end(out, "--out") as write, shown_progress() as progress:
+        from finqd.explain import explain as run
+
+        found = run(chosen, objects=objects, preset=preset, what_if=what_if, jobs=jobs, progress=progress)
+        rows = {one.object_name: one.to_dict() for one in found}
+        write(json.dumps(rows, indent=2, allow_nan=False) + "\n")
+    for name, row in rows.items():
+        print_explanation(name, row)
+
+
+@finqd.command()
 @click.option("--iterations", type=click.IntRange(1), default=5, show_default=True, help="Rounds of the search.")
 @click.option("--batch", type=click.IntRange(1), default=15, show_default=True, help="Designs a round.")
 @_objects_option

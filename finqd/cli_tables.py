@@ -81,6 +81,44 @@ def _estimate_line(estimate: Mapping[str, Any]) -> str:
     return f"error estimate: {uncertain}; simulated for: {seconds}"
 
 
+def print_explanation(name: str, row: Mapping[str, Any]) -> None:
+    """Print the effects of one grasp (`finqd.explain.Explanation.to_dict`), a row each, and what came of it."""
+    console = _console()
+    console.print(f"[bold]{escape(name)}[/bold]: {escape(_outcome(row))}", soft_wrap=True)
+    if row["reason"]:
+        console.print(escape(row["reason"]), soft_wrap=True)
+    asked = any("what_if" in line for line in row["effects"].values())
+    more = ("the other way round", "held", "force [%]>", "drop [mm]>", "seconds>") if asked else ()
+    table = _table("effect", "", "since [s]>", *more, "why")
+    for effect, line in row["effects"].items():
+        other = line.get("what_if", {})
+        cells = _changes(row, other) if asked else []
+        table.add_row(effect, line["state"], _number(line["since_s"], 2), *cells, escape(line["why"]))
+    console.print(table)
+    for effect, line in row["effects"].items():
+        if line.get("what_if", {}).get("reason"):
+            console.print(escape(f"{effect} {line['what_if']['reason']}"), soft_wrap=True)
+
+
+def _outcome(row: Mapping[str, Any]) -> str:
+    verdict = ("held" if row["held"] else "lost") if row["status"] == "ok" else row["status"]
+    drop, force = _number(row["drop_mm"], 2), _number(row["force_N"], 2)
+    return f"{verdict}, drop {drop} mm, force {force} N, {row['seconds']:.1f} s"
+
+
+def _changes(row: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return what another grasp changes: state, verdict, force as a share, drop, and seconds as a factor."""
+    if not other.get("state"):
+        return [""] * 5
+    verdict = ("yes" if other["held"] else "no") if other["status"] == "ok" else other["status"]
+    changes = [other["state"], verdict if other["held"] == row["held"] else f"[red]{verdict}[/red]"]
+    both = row["force_N"] and other["force_N"] is not None
+    changes.append(f"{100 * (other['force_N'] / row['force_N'] - 1):+.1f}" if both else "-")
+    dropped = row["drop_mm"] is not None and other["drop_mm"] is not None
+    changes.append(f"{other['drop_mm'] - row['drop_mm']:+.2f}" if dropped else "-")
+    return [*changes, f"x {other['seconds'] / row['seconds']:.2f}" if row["seconds"] > 0.0 else "-"]
+
+
 def print_presets() -> None:
     """Print what each preset sets, and its measured errors."""
     from finqd.accuracy_bands import bands, preset_sentence

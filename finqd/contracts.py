@@ -131,6 +131,9 @@ class ContactPotential(Protocol):
     relagged_forces: the same at the state of the last `relag`
     penetration: largest at the last committed state [m]
 
+    One that knows when bodies first come within reach of each other may say so: ``met_pairs()`` returns times [s] by
+    the names of two bodies, ``(a, b)``; ``(a, a)`` are a body's own faces.
+
     One that couples vertices of different faces, as contact of soft bodies with each other does, has in addition
     ``couplings(state)``: it is asked before each `add_hessian`, and returns the pairs of vertices, (n, 2), that the
     Hessian at ``state`` needs and the last bound pattern does not have (`BlockPattern.lacks`). Then `bind` is called

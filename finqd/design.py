@@ -44,6 +44,7 @@ from finqd.design_schema import (
     read_document,
     read_number,
 )
+from finqd.effects import refuse_contradictions
 from finqd.errors import InputError
 from finqd.json_input import read_json_object
 from finqd.mechanics.material import Material
@@ -70,6 +71,7 @@ class Design:
         document, warnings = read_document(self.document, self.source)
         object.__setattr__(self, "document", _frozen(document))
         object.__setattr__(self, "warnings", tuple(warnings))
+        refuse_contradictions(self, self.source)
 
     def __hash__(self) -> int:
         return hash(self.to_json())
@@ -228,6 +230,11 @@ class Design:
     def protocol(self) -> GraspProtocol:
         """The constants of a grasp."""
         return GraspProtocol(**self.document.get("protocol", {}))
+
+    @property
+    def forced_effects(self) -> Mapping[str, str]:
+        """Effect -> "on" or "off", of those that are not left to themselves (see `finqd.effects`)."""
+        return self.document.get("effects", {})
 
     @property
     def settings(self) -> dict[str, Any]:

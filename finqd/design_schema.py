@@ -15,6 +15,7 @@ from annotated_types import Ge, Gt, Le
 
 from finqd import registry
 from finqd.contracts import Parameter
+from finqd.effects import effects_schema, read_effects
 from finqd.errors import InputError, PluginError
 from finqd.mechanics.material import Material
 from finqd.options import checked_fields, in_words, join, option_schemas, refuse_unknown, require_object, shown
@@ -36,7 +37,10 @@ DEFAULT_PLUGINS: dict[str, Any] = {
 }
 
 #: keys of a design file, in the order in which they are written
-KEYS = ("name", "description", "geometry", "finger", "fingers", "spacing_mm", "material", *DEFAULT_PLUGINS, "protocol")
+KEYS = (
+    "name", "description", "geometry", "finger", "fingers", "spacing_mm", "material", *DEFAULT_PLUGINS, "effects",
+    "protocol",
+)  # fmt: skip
 
 #: texts that a design file may hold, and how long they may be; they change nothing
 TEXTS = {"name": 100, "description": 1000}
@@ -99,6 +103,10 @@ def read_document(document: Mapping[str, Any], place: str) -> tuple[dict[str, An
     for kind in DEFAULT_PLUGINS:
         if kind in document:
             read[kind] = _read_plugins(kind, document[kind], join(place, kind))
+    if "effects" in document:
+        forced = read_effects(document["effects"], join(place, "effects"))
+        if forced:  # "auto" is what a design without them has
+            read["effects"] = forced
     _check_damping(read, join(join(place, "material"), "rayleigh_stiffness_ms"))
     return {key: read[key] for key in KEYS if key in read}, warnings
 
@@ -253,6 +261,7 @@ def design_schema(geometry: str = "fin_ray") -> dict[str, Any]:
         },
         "spacing_mm": parameter_schema(SPACING),
         "material": _object_schema(option_schemas(MaterialSection)),
+        "effects": effects_schema(),
         "protocol": _object_schema(option_schemas(GraspProtocol)),
     }
     for kind, default in DEFAULT_PLUGINS.items():

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from finqd.accuracy_bands import accuracy
-from finqd.assumptions import ASSUMPTIONS, effects_of, reductions_of
+from finqd.assumptions import ASSUMPTIONS, reductions_of
 from finqd.contracts import FitnessResult
 from finqd.early_verdict import object_heights
+from finqd.effects import effects_of
 from finqd.errors import FinqdError, InputError, MeshError
 from finqd.grasp import GraspTask, base_height, simulate_grasp
 from finqd.meshing import mesh_solid
@@ -96,7 +97,7 @@ class Evaluation:
             "max_penetration_mm": _finite(np.max(penetrations, initial=0.0) / MM) if simulated else None,
             "final_height_mm": _finite(_final_height(trajectory) / MM) if simulated else None,
             "simulated_s": float(trajectory.times[-1]) if simulated else 0.0, "ended": trajectory.ended,
-            "steps": trajectory.counters.get("steps", 0),
+            "effects": dict(trajectory.effects), "steps": trajectory.counters.get("steps", 0),
             "newton_iterations": trajectory.counters.get("newton_iterations", 0),
             "counters": dict(trajectory.counters),
             "seconds": trajectory.timings.get("set_up", 0.0) + trajectory.timings.get("steps", 0.0), **estimate,

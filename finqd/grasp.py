@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from finqd.early_verdict import EarlyVerdict, object_heights
+from finqd.effects import effects_seen, with_effects
 from finqd.placement import placement
 from finqd.scene import Scene, Shift, Timed
 from finqd.simulate import simulate
@@ -72,8 +73,12 @@ def base_height(meshes: Sequence[Mesh], protocol: GraspProtocol) -> float:
 
 
 def grasp_scene(task: GraspTask) -> Scene:
-    """Return the scene of a grasp: first the fingers, then the object; the floor is z = 0, the gripper's axis is z."""
-    design, protocol = task.design, task.design.protocol
+    """Return the scene of a grasp: first the fingers, then the object; the floor is z = 0, the gripper's axis is z.
+
+    Effects that the design forces off are left out.
+    """
+    design = with_effects(task.design)
+    protocol = design.protocol
     scene = Scene(gravity=(0.0, 0.0, -protocol.si("gravity_m_s2")), friction=protocol.friction_coefficient)
     height = base_height(task.meshes, protocol)
     count = len(task.meshes)
@@ -84,10 +89,16 @@ def grasp_scene(task: GraspTask) -> Scene:
     motions = design.plugin("actuation").motions(placements)
     for i, (mesh, pose, motion) in enumerate(zip(task.meshes, placements, motions, strict=True)):
         finger = scene.add_soft(mesh.transformed(pose), design.material, elasticity=elasticity, name=f"finger {i + 1}")
+        finger.weightless = design.forced_effects.get("gravity_on_fingers") == "off"
         finger.drive("base", replace(motion, start=motion.start + protocol.si("settle_s"), carriers=(lift,)))
-    scene.add_plane(name=FLOOR)
-    _add_object(scene, task.grasped)
+    off = {name for name, state in design.forced_effects.items() if state == "off"}
+    if "floor" not in off:
+        scene.add_plane(name=FLOOR)
+    _add_object(scene, replace(task.grasped, soft=None) if "soft_object" in off else task.grasped)
+    _leave_out(scene, off, fingers=_named(scene, task, "finger"), grasped=task.grasped.name)
     for pair, key in FRICTION.items():
+        if "floor" in off and FLOOR in pair:
+            continue
         coefficient = getattr(protocol, key)
         if coefficient is not None:
             for one in _named(scene, task, pair[0]):
@@ -103,6 +114,17 @@ def _add_object(scene: Scene, grasped: GraspObject) -> None:
     material = grasped.soft.material(grasped.mass / grasped.mesh.volume)
     body = grasped.mesh.transformed(object_pose(grasped))
     scene.add_soft(body, material, elasticity=grasped.soft.elasticity, name=grasped.name)
+
+
+def _leave_out(scene: Scene, off: set[str], *, fingers: Sequence[str], grasped: str) -> None:
+    """Let bodies pass through each other whose contact is an effect that is ``off``."""
+    for i, finger in enumerate(fingers):
+        if "object_contact" in off:
+            scene.ignore(finger, grasped)
+        if "self_contact" in off:
+            scene.ignore(finger, finger)
+        for other in fingers[:i] if "finger_to_finger_contact" in off else ():
+            scene.ignore(other, finger)
 
 
 def object_pose(grasped: GraspObject) -> np.ndarray:
@@ -154,7 +176,8 @@ def simulate_grasp(task: GraspTask, *, progress: Callable[[float], None] | None 
 
 
 def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Trajectory:
-    design, protocol = task.design, task.design.protocol
+    design = with_effects(task.design)
+    protocol = design.protocol
     scene = grasp_scene(task)
     overlap = overlap_at_start(scene, task.grasped)
     if overlap is not None:
@@ -166,9 +189,19 @@ def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Tra
         longest_step=protocol.calm_step_factor, decided=early_verdict(design) if protocol.early_verdict else None,
     )
     return replace(
-        trajectory, object_name=task.grasped.name, protocol=protocol, object_drop=object_drop(trajectory, protocol),
+        trajectory, effects=_effects(scene, task, trajectory), object_name=task.grasped.name, protocol=protocol,
+        object_drop=object_drop(trajectory, protocol),
         contact_forces=trajectory.contact_forces[:, : len(task.meshes)],
     )
+
+
+def _effects(scene: Scene, task: GraspTask, trajectory: Trajectory) -> dict[str, Any]:
+    """Return since when effects between bodies were needed, and why; nothing if the contact model does not say."""
+    met = {(a, b): time for a, b, time in trajectory.effects.get("met", ())}
+    return effects_seen(
+        met, fingers=_named(scene, task, "finger"), grasped=task.grasped.name, floor=FLOOR,
+        rubs=lambda a, b: scene.friction_between(a, b) > 0.0,
+    ) if met else {}
 
 
 def object_drop(trajectory: Trajectory, protocol: GraspProtocol) -> float:

@@ -290,4 +290,8 @@ def simulate(
     if keeper is not None:
         keeper.save(run)
     timings = {"set_up": set_up, "steps": clock.perf_counter() - begun - set_up}
-    return run.recorder.trajectory(status=run.status, reason=run.reason, ended=run.ended, timings=timings)
+    met = [[*pair, time] for pair, time in getattr(system.contact, "met_pairs", dict)().items()]
+    return run.recorder.trajectory(
+        status=run.status, reason=run.reason, ended=run.ended, timings=timings,
+        effects={"met": met} if met else {},
+    )

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from finqd import registry
-from finqd.assumptions import effects_of
 from finqd.data import designs_folder
 from finqd.design import Design
+from finqd.effects import effects_of
 from finqd.errors import InputError
 from finqd.mechanics import damping as damping_module
 from finqd.mechanics.damping import StepDamping, ViscousBlock

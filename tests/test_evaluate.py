@@ -13,9 +13,9 @@ from numba import njit
 
 from finqd import cli
 from finqd import evaluate as module
-from finqd.assumptions import EFFECTS
 from finqd.data import designs_folder
 from finqd.design import Design
+from finqd.effects import EFFECTS
 from finqd.errors import InputError, MeshError, MissingLibraryError
 from finqd.evaluate import Evaluation, evaluate
 from finqd.grasp import compile_clock
@@ -69,7 +69,11 @@ def test_the_result_says_everything_and_is_json(result):
         assert row["newton_iterations"] + row["counters"]["quasi_iterations"] >= row["steps"] > 10
     assert result["mesh"]["elements"]["hex20"] > 100 and result["mesh"]["dofs"] == 3 * result["mesh"]["vertices"]
     assert result["reductions"].keys() == {"early_verdict", "long_steps"}
-    assert result["effects"] == EFFECTS and len(set(result["assumptions"])) == len(result["assumptions"]) > 5
+    assert result["effects"] == {name: effect.plain for name, effect in EFFECTS.items()}
+    assert len(set(result["assumptions"])) == len(result["assumptions"]) > 5
+    for row in result["objects"].values():
+        seen = row["effects"]
+        assert 0.0 < seen["object_contact"]["since_s"] < row["simulated_s"] and seen["floor"]["since_s"] == 0.0
     assert result["versions"].keys() >= {"finqd", "numpy", "numba", "gmsh"}
     assert Design.from_json(json.dumps(result["design"])).digest() == result["digest"], "a result can be run again"
 

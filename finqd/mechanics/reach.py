@@ -1,4 +1,4 @@
-"""Which bodies of a scene may touch, and when they first come within reach of each other: contact costs from then on."""
+"""Which bodies of a scene may touch, and when they first come within reach: contact costs from then on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ if TYPE_CHECKING:
     from finqd.mechanics.state import State
     from finqd.scene import Plane, RigidBody, Scene
 
-BULGE = 1.0  # of a face's extent by which points on it may lie outside the box of its vertices, if it is curved
+ROUNDING = 1e-9  # [m]
+#: edges of faces by their number of vertices: corner, node between, corner
+EDGES = {
+    6: ((0, 3, 1), (1, 4, 2), (2, 5, 0)),
+    8: ((0, 4, 1), (1, 5, 2), (2, 6, 3), (3, 7, 0)),
+}
 
 
 def met_by_soft(scene: Scene, other: RigidBody | Plane) -> bool:
@@ -35,7 +40,7 @@ class Reach:
     def __init__(self, scene: Scene, faces: np.ndarray) -> None:
         self.scene = scene
         self.spans = [(b.first_vertex, b.first_vertex + b.mesh.n_vertices) for b in scene.soft_bodies]
-        self.margin = BULGE * _largest_extent(scene, faces)
+        self._edges = _bent_edges(faces)
         soft, rigid, planes = scene.soft_bodies, scene.rigid_bodies, scene.planes
         every = [("rigid", i, r, a.name, b.name) for i, a in enumerate(soft) for r, b in enumerate(rigid)]
         every += [("plane", i, p, a.name, b.name) for i, a in enumerate(soft) for p, b in enumerate(planes)]
@@ -49,9 +54,21 @@ class Reach:
         low, high = np.empty(3), np.empty(3)
         body_box(state.positions, *self.spans[i], low, high)
         centre = state.rigid_positions[r]
-        apart = np.maximum(np.maximum(low - centre, centre - high), 0.0)
-        reach = self.scene.rigid_bodies[r].shape.bounding_radius + self.margin
-        return not float(apart @ apart) > reach * reach  # so for a NaN
+        away = np.maximum(np.maximum(low - centre, centre - high), 0.0)
+        apart = float(np.sqrt(away @ away)) - self.scene.rigid_bodies[r].shape.bounding_radius - ROUNDING
+        return not (apart > 0.0 and apart > self.bulge(state.positions))  # so for a NaN
+
+    def bulge(self, positions: np.ndarray) -> float:
+        """Return how far points on curved faces may lie outside the box of their vertices at ``positions`` [m].
+
+        What lies on pieces between vertices is inside. A face's middle is the mean of its corners plus half of what
+        its nodes between are off their edges, in sum: no more than the largest of these is outside.
+        """
+        if not len(self._edges):
+            return 0.0
+        one, between, other = self._edges.T
+        off = positions[between] - 0.5 * (positions[one] + positions[other])
+        return float(np.sqrt(np.max(np.einsum("ni,ni->n", off, off))))
 
     def any_near_rigid(self, state: State, r: int) -> bool:
         """Tell whether any soft body may touch rigid body ``r``."""
@@ -66,7 +83,7 @@ class Reach:
             elif kind == "soft":
                 near = soft is not None and soft.near.has_near(one, other)
             else:
-                near = self._height(kind, state, one, other) <= self.margin
+                near = self._height(kind, state, one, other) <= 0.0
             if near:
                 self.times[k] = state.time
 
@@ -77,17 +94,19 @@ class Reach:
             centre, shape = state.rigid_positions[one], self.scene.rigid_bodies[one].shape
             return float((centre - plane.point) @ plane.normal) - shape.bounding_radius
         first, end = self.spans[one]
-        return float(np.min((state.positions[first:end] - plane.point) @ plane.normal, initial=np.inf))
+        lowest = float(np.min((state.positions[first:end] - plane.point) @ plane.normal, initial=np.inf))
+        return lowest - self.bulge(state.positions)
 
     def met(self) -> dict[tuple[str, str], float]:
         """Return when pairs came within reach first [s], by their names; pairs that have not are not in it."""
         return {(a, b): float(t) for (*_, a, b), t in zip(self._pairs, self.times) if not np.isnan(t)}
 
 
-def _largest_extent(scene: Scene, faces: np.ndarray) -> float:
-    """Return the largest distance of two vertices of a face at rest, along an axis [m]."""
-    if not len(faces):
-        return 0.0
-    rest = np.concatenate([body.mesh.vertices for body in scene.soft_bodies])
-    points = rest[np.where(faces >= 0, faces, faces[:, :1])]
-    return float(np.max(points.max(axis=1) - points.min(axis=1)))
+def _bent_edges(faces: np.ndarray) -> np.ndarray:
+    """Return the edges of ``faces`` (n_faces, k) that have a node between their corners, (n, 3) vertices."""
+    found = [np.zeros((0, 3), dtype=np.int64)]
+    for size, edges in EDGES.items():
+        mine = faces[np.sum(faces >= 0, axis=1) == size]
+        if len(mine):
+            found.append(mine[:, np.array(edges)].reshape(-1, 3))
+    return np.unique(np.concatenate(found), axis=0)

@@ -321,6 +321,10 @@ class PenaltyContact:
             "met": self.reach.times.copy(),
         }
 
+    def met_pairs(self) -> dict[tuple[str, str], float]:
+        """Return when bodies first came within reach of each other [s], by their names."""
+        return self.reach.met()
+
     def restore(self, history: dict[str, np.ndarray]) -> None:
         """Go on with a `history`."""
         self.slips = KeyedValues(keys=history["slip_keys"], values=history["slips"])
