@@ -57,7 +57,8 @@ def block_over_ball(height: float, *, velocity: float = 0.0, gravity: float = 0.
 
 @pytest.mark.parametrize(("value", "forced"), [
     ("auto", {}), ({}, {}), ({"friction": "auto"}, {}),
-    ({"floor": "off", "friction": "off"}, {"friction": "off", "floor": "off"}), (list(EFFECTS), {"material_nonlinearity": "on"}),
+    ({"floor": "off", "friction": "off"}, {"friction": "off", "floor": "off"}),
+    (list(EFFECTS), {"material_nonlinearity": "on"}),
 ])  # fmt: skip
 def test_what_is_asked_for_has_one_form(value, forced):
     assert read_effects(value, "effects") == forced and list(read_effects(value, "effects")) == list(forced)

@@ -12,6 +12,7 @@ from annotated_types import Ge, Gt, Le
 
 from finqd.mechanics import contact_force_kernels as forces
 from finqd.mechanics import contact_kernels as kernels
+from finqd.mechanics.contact_pairs import ContactPairs
 from finqd.mechanics.contact_rows import FrictionBounds, FrictionRows, KeyedValues, Rows
 from finqd.mechanics.contact_surface import ContactSurface, Sight, contact_surface
 from finqd.mechanics.mass_properties import thickness
@@ -108,7 +109,8 @@ class PenaltyContact:
         self.sights = {r: Sight(self.surface, n_vertices) for r in self.met}
         self.reach = Reach(scene, self.surface.faces)
         self.soft = self._soft_contact()
-        self._lay_out_keys()
+        self.pairs = ContactPairs(scene, self.surface)
+        self.first_key = self.pairs.first_key
         self.rows = Rows(256, self.surface.faces.shape[1])
         self.friction = FrictionRows.empty(self.surface.faces.shape[1])
         nothing = np.zeros(0, dtype=np.int64)
@@ -143,38 +145,6 @@ class PenaltyContact:
         pressure = options.soft_stiffness_N_mm3 / MM**3
         return SoftContact(self.scene, surface, gap=gap, pressure=pressure, ratio=ratio)
 
-    def _lay_out_keys(self) -> None:
-        """Number all possible contacts: ``first_key`` of each pair, and friction by `_coefficients`."""
-        scene, n = self.scene, self.surface.n_samples
-        self.first_key: dict[tuple, int] = {}
-        starts, self._pair_friction = [], []
-        count = 0
-        for kind, others in (("rigid", scene.rigid_bodies), ("plane", scene.planes)):
-            for i, other in enumerate(others):
-                self.first_key[kind, i] = count
-                starts.append(count)
-                self._pair_friction.append([scene.friction_between(b.name, other.name) for b in scene.soft_bodies])
-                count += n
-        for r, rigid in enumerate(scene.rigid_bodies):
-            for p, plane in enumerate(scene.planes):
-                self.first_key["support", r, p] = count
-                starts.append(count)
-                self._pair_friction.append([scene.friction_between(rigid.name, plane.name)])
-                count += max(len(rigid.shape.support_points), 1)
-        self.first_key["soft", 0] = count
-        self._starts = np.array(starts, dtype=np.int64)
-
-    def _coefficients(self) -> np.ndarray:
-        """Return Coulomb's coefficient of each row, shape (count,)."""
-        rows = self.rows
-        face, found = rows.face[: rows.count], np.zeros(rows.count)
-        body = np.where(face >= 0, self.surface.face_body[face], 0) if len(self.surface.faces) else face + 1
-        pair = np.searchsorted(self._starts, rows.key[: rows.count], side="right") - 1
-        for p in np.unique(pair):
-            mine = pair == p
-            found[mine] = np.array(self._pair_friction[p])[body[mine]]
-        return found
-
     def bind(self, pattern: BlockPattern) -> None:
         """Look up where in the Hessian's blocks each face's pairs of vertices go."""
         self.pattern, self.face_slots = pattern, pattern.slots(self.surface.faces)
@@ -201,7 +171,7 @@ class PenaltyContact:
         self._find(state)
         rows = self.rows
         force = rows.forces(self.options.smoothing_mm * MM)
-        keys, wanted = rows.key[: rows.count].copy(), self._coefficients() * force
+        keys, wanted = rows.key[: rows.count].copy(), self.pairs.coefficients(rows) * force
         if self.soft is not None:
             self.soft.find(state.positions)
             keys = np.concatenate([keys, self.soft.keys + self.first_key["soft", 0]])
