@@ -265,6 +265,20 @@ def test_scenes_of_grasps_leave_out_what_is_off(task):
     assert len(plain.planes) == 1 and not plain.ignored and not any(body.weightless for body in plain.soft_bodies)
 
 
+@pytest.mark.parametrize("effect", ["object_contact", "self_contact", "finger_to_finger_contact"])
+def test_a_contact_that_is_off_is_not_watched(task, effect):
+    scene = grasp_scene(forced(task, **{effect: "off"}))
+    contact = System(scene, contact=contact_penalty.Penalty()).contact
+    watched = {watch.bodies for watch in contact.soft.near.watches}
+    own, pairs = {(i, i) for i in range(3)}, {(0, 1), (0, 2), (1, 2)}
+    assert watched == {"self_contact": pairs, "finger_to_finger_contact": own}.get(effect, own | pairs)
+    assert contact.met == ([] if effect == "object_contact" else [0])
+    state = System(scene, contact=contact_penalty.Penalty()).initial_state()
+    contact.begin_step(state)
+    contact.commit(state)
+    assert contact.penetration >= 0.0
+
+
 def test_without_contact_the_object_stays_on_the_floor(task):
     run = simulate_grasp(forced(task, object_contact="off"))
     assert run.status == "ok" and run.contact_forces.max() == 0.0

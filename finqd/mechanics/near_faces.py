@@ -133,7 +133,7 @@ class NearFaces:
         self._room = 256  # for pairs
         alone = [watch for watch in self.watches if len(set(watch.bodies)) == 1]
         notches = [self.pairs(rest, watch, NOTCH * gap)[0] for watch in alone]
-        self._apart = np.sort(np.concatenate([pairs @ self._radix for pairs in notches]))
+        self._apart = np.sort(np.concatenate([self._apart, *(pairs @ self._radix for pairs in notches)]))
 
     @property
     def _radix(self) -> np.ndarray:
