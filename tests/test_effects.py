@@ -279,6 +279,14 @@ def test_a_contact_that_is_off_is_not_watched(task, effect):
     assert contact.penetration >= 0.0
 
 
+def test_a_soft_object_is_rigid_if_its_softness_is_off(task):
+    soft = load_object({"name": "pad", "shape": {"kind": "box", "size_mm": [20, 20, 10]}, "mass_g": 5,
+                        "soft": {"youngs_modulus_MPa": 0.3, "element_size_mm": 8}})
+    both = [grasp_scene(replace(forced(task, **states), grasped=soft)) for states in ({}, {"soft_object": "off"})]
+    assert [len(scene.soft_bodies) for scene in both] == [4, 3]
+    assert [body.name for body in both[1].rigid_bodies] == ["pad"]
+
+
 def test_without_contact_the_object_stays_on_the_floor(task):
     run = simulate_grasp(forced(task, object_contact="off"))
     assert run.status == "ok" and run.contact_forces.max() == 0.0
