@@ -26,8 +26,9 @@ from typing import Any
 
 from peer_cases import CASES, Outcome, PeerCase, Task, Variant
 
-from finqd.errors import InputError
+from finqd.errors import FinqdError, InputError
 from finqd.study_log import append_row, read_rows
+from finqd.verification.cases import Failed
 
 LADDER = (0.04, 0.02, 0.01, 0.005, 0.002, 0.001)  # [s]
 SAME = 0.01  # share by which the result of the next smaller step may differ
@@ -75,21 +76,31 @@ def ask(program: str, python: str, task: Task, *, timeout: float, **more: str) -
 
 
 def down_the_ladder(case: PeerCase, variant: Variant, python: str, limit: float) -> Outcome:
-    """Return the outcome of the largest time step that is good enough, or of the smallest with why it is not."""
+    """Return the outcome of the largest time step that is good enough, or the last one with why it may not be.
+
+    ``ladder``: what every step that was tried gave, by milliseconds.
+    """
     task: Task = {**case.task(variant.mesh), "stepper": variant.stepper, "limit_s": limit, "repeats": 2}
     dofs, larger = 3 * (len(task["vertices"]) - len(task["clamped"])), {"failed": "not run"}
+    ladder: dict[str, Any] = {}
     for step in LADDER:
         found = ask(variant.program, python, {**task, "time_step": step}, timeout=4 * limit)
-        found = {**found, "time_step": step, "dofs": dofs}
+        found = {**found, "time_step": step, "dofs": dofs, "ladder": ladder}
         if not found["failed"]:
             found["value"] = case.value(found)
-        if not found["failed"] and not larger["failed"]:
+        ladder[f"{1e3 * step:g}"] = found["failed"] or found["value"]
+        if not larger["failed"]:
+            if found["failed"]:
+                return noted(larger, f"{1e3 * step:g} ms: {found['failed']}")
             if abs(found["value"] - larger["value"]) <= SAME * abs(found["value"]):
-                return {**larger, "changes": found["value"] / larger["value"] - 1.0}
-        if found["failed"] and not larger["failed"]:
-            return noted(larger, f"{1e3 * step:g} ms: {found['failed']}")
+                return larger
         larger = found
     return larger if larger["failed"] else noted(larger, "smaller steps may change it")
+
+
+def stepper_of(variant: Variant) -> str:
+    """Return the name of finqd's stepper, nothing for peers, which have their own."""
+    return variant.stepper["name"] if variant.program == "finqd" else ""
 
 
 def noted(found: Outcome, remark: str) -> Outcome:
@@ -97,14 +108,16 @@ def noted(found: Outcome, remark: str) -> Outcome:
     return {**found, "note": "; ".join(filter(None, [found.get("note", ""), remark]))}
 
 
-def measured(name: str, variant: Variant, python: str, *, limit: float, cold: bool) -> dict[str, Any]:
-    """Return the row of one program in one case."""
+def measured(
+    name: str, variant: Variant, python: str, *, reference: tuple[float, str], limit: float, cold: bool
+) -> dict[str, Any]:
+    """Return the row of one program in one case, with what it is held against."""
     case = CASES[name]
     found = down_the_ladder(case, variant, python, limit)
-    stepper = variant.stepper["name"] if variant.program == "finqd" else ""
-    row = {"case": name, "asked": variant.program, "mesh": variant.mesh, "stepper": stepper, **found}
+    row = {"case": name, "asked": variant.program, "mesh": variant.mesh, "stepper": stepper_of(variant), **found}
+    row["reference"], row["source"] = reference
     if not found["failed"]:
-        row["error"] = found["value"] / case.reference()[0] - 1.0
+        row["error"] = found["value"] / reference[0] - 1.0
         row["check"] = case.check(found)
     if cold and variant.program == "finqd" and not found["failed"]:
         task = {**case.task(variant.mesh), "stepper": variant.stepper, "limit_s": limit, "repeats": 1}
@@ -131,8 +144,11 @@ def line(row: dict[str, Any], unit: str) -> str:
 def table(name: str, rows: list[dict[str, Any]]) -> None:
     """Print the rows of one case."""
     case = CASES[name]
-    reference, source = case.reference()
-    print(f"\n{name}: {case.title}\nreference: {reference:.4g} {case.unit} ({source}); {case.effects}\n")
+    if not rows:
+        print(f"\n{name}: {case.title}\nno rows")
+        return
+    found = f"{rows[0]['reference']:.4g} {case.unit} ({rows[0]['source']})"
+    print(f"\n{name}: {case.title}\nreference: {found}; {case.effects}\n")
     print(f"| program | mesh | unknowns | time step | seconds | cold | {case.quantity} | off | |")
     print("|---|---|---|---|---|---|---|---|---|")
     for row in rows:
@@ -178,28 +194,32 @@ def run(arguments: argparse.Namespace) -> None:
     logged = [] if arguments.log is None else read_rows(arguments.log)
     kept = {(row["case"], row["asked"], row["mesh"], row["stepper"]): row for row in logged}
     for name in cases:
-        rows = []
+        known = [(row["reference"], row["source"]) for row in kept.values() if row["case"] == name]
         for variant in CASES[name].variants:
-            stepper = variant.stepper["name"] if variant.program == "finqd" else ""
-            key = (name, variant.program, variant.mesh, stepper)
-            if key not in kept and variant.program in pythons and not arguments.report:
-                kept[key] = measured(
-                    name, variant, pythons[variant.program], limit=arguments.limit_s, cold=arguments.cold
-                )
-                if arguments.log is not None:
-                    append_row(arguments.log, kept[key])
-            if key in kept:
-                rows.append(kept[key])
-        table(name, rows)
+            key = (name, variant.program, variant.mesh, stepper_of(variant))
+            if key in kept or variant.program not in pythons or arguments.report:
+                continue
+            known = known or [CASES[name].reference()]
+            kept[key] = measured(
+                name, variant, pythons[variant.program], reference=known[0], limit=arguments.limit_s,
+                cold=arguments.cold,
+            )
+            if arguments.log is not None:
+                append_row(arguments.log, kept[key])
+        wanted = [(name, v.program, v.mesh, stepper_of(v)) for v in CASES[name].variants]
+        table(name, [kept[key] for key in wanted if key in kept])
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Return the exit status: 2 for what was typed wrongly."""
+    """Return the exit status: 2 for what was typed wrongly, 1 where a reference could not be computed."""
     try:
         run(arguments_of(argv))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except (FinqdError, Failed) as error:  # of a reference
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -42,7 +42,7 @@ def test_the_largest_step_that_the_next_one_confirms_is_taken(monkeypatch):
     found = laddered(monkeypatch, {0.04: 5.0, 0.02: 7.0, 0.01: 7.05, 0.005: 7.06})
     assert found["time_step"] == 0.02
     assert found["value"] == pytest.approx(7.0)
-    assert found["changes"] == pytest.approx(0.05 / 7.0)
+    assert list(found["ladder"]) == ["40", "20", "10"]
     assert "note" not in found
 
 
