@@ -64,6 +64,23 @@ def test_a_program_that_never_runs_is_a_row_with_the_reason(monkeypatch):
     assert "blew up" in peers.line(row, "mm")
 
 
+def test_a_cold_run_has_a_cache_of_its_own_and_is_reported_beside_the_warm_one(monkeypatch):
+    caches = []
+
+    def answer(program, python, task, *, timeout, **more):
+        caches.append(more.get("NUMBA_CACHE_DIR"))
+        return {
+            "failed": "", "displacement": [0.0, 0.0, -7e-3], "first_s": 80.0, "seconds": 1.0, "set_up_s": 0.1,
+            "solver": "implicit_euler", "program": "finqd",
+        }
+
+    monkeypatch.setattr(peers, "ask", answer)
+    row = peers.measured("sag_0.3", VARIANT, "python", reference=(10.0, "made up"), limit=1.0, cold=True)
+    assert caches[:2] == [None, None] and len(caches) == 3 and caches[2]
+    assert row["cold_s"] == 80.0 and row["error"] == pytest.approx(-0.3)
+    assert "| 1.10 | 80 | 7 mm | -30.0 % |" in peers.line(row, "mm")
+
+
 @pytest.mark.parametrize("name", ["sag_0.49", "weight"])
 def test_linear_tetrahedra_of_a_task_are_those_of_its_blocks(name):
     task = peer_cases.CASES[name].task("tet4 4x2x2")
