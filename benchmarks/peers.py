@@ -62,13 +62,14 @@ def missing(program: str, python: str) -> str:
 def ask(program: str, python: str, task: Task, *, timeout: float, **more: str) -> Outcome:
     """Run one task in a process of its own; whatever goes wrong there is ``failed``, one sentence."""
     command = [python, str(FOLDER / f"peer_{program}.py")]
-    try:
-        done = subprocess.run(
-            command, input=json.dumps(task), capture_output=True, text=True, timeout=timeout,
-            env=environment(program, **more), cwd=tempfile.gettempdir(),
-        )
-    except subprocess.TimeoutExpired:
-        return {"failed": f"not done after {timeout:g} s"}
+    with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a file of its warnings where it runs
+        try:
+            done = subprocess.run(
+                command, input=json.dumps(task), capture_output=True, text=True, timeout=timeout, cwd=folder,
+                env=environment(program, **more),
+            )
+        except subprocess.TimeoutExpired:
+            return {"failed": f"not done after {timeout:g} s"}
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"]
         return {"failed": " ".join(lines[-1].split())}
