@@ -61,7 +61,8 @@ class Trajectory:
     soft_positions: [m], (n_recorded, n_vertices, 3), at recorded_times [s], (n_recorded,): empty without recording
     counters: steps, rejected_steps, newton_iterations, line_search_steps, factorisations, cg_iterations, ...
     object_drop: how far the object fell relative to the gripper [m], NaN if unknown
-    protocol: constants of the grasp, None for other scenes; timings: name -> seconds; effects: name -> why on or off
+    protocol: constants of the grasp, None for other scenes; timings: name -> seconds, or what `finqd.profiling`
+        left there; effects: name -> why on or off
     """
 
     status: str
