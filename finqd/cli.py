@@ -89,11 +89,12 @@ _set_option = click.option(
               help="Keep each simulation there as it goes on; one that was stopped goes on from there.")
 @click.option("--estimate-error", is_flag=True,
               help="Simulate again with a coarser mesh and with longer steps, and say how far off the result is.")
+@click.option("--profile", is_flag=True, help="Say where the time went, by kind of work.")
 @click.option("--quiet", is_flag=True, help="Print nothing but what goes wrong.")
 def evaluate(
     design: str, object_names: tuple[str, ...], surfaces: tuple[str, ...], mass_g: float | None, out: Path | None,
     jobs: int, preset: str, settings: tuple[str, ...], record: Path | None, checkpoints: Path | None,
-    estimate_error: bool, quiet: bool,
+    estimate_error: bool, profile: bool, quiet: bool,
 ) -> None:
     """Build a gripper, close it on every object in a simulation, and say which it holds."""
     from finqd.cli_files import usable_folder, written_at_end
@@ -108,7 +109,7 @@ def evaluate(
 
         result = run(
             chosen, objects=objects, preset=preset, jobs=jobs, record=folder, progress=progress,
-            estimate_error=estimate_error, checkpoints=kept,
+            estimate_error=estimate_error, checkpoints=kept, profile=profile,
         )
         write(json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     if not quiet:

@@ -58,7 +58,33 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
         console.print(_estimate_line(result["estimate"]), soft_wrap=True)
     for part in ("features", "mesh", "effects", "timings", "assumptions"):
         _print_part(console, part, result.get(part))
+    if "profile" in result:
+        print_profile(result["profile"])
     _print_part(console, "protocol", result.get("design", {}).get("protocol"))
+
+
+def print_profile(profile: Mapping[str, Any]) -> None:
+    """Print where the time went (`finqd.profiling.total`): a row a category, then what the shares of steps are."""
+    console, steps = _console(), profile["steps"]
+    count = profile["simulations"]
+    console.print(f"[bold]profile[/bold] of {count} simulation{'' if count == 1 else 's'}, added up")
+    table = _table("", "seconds>", "share>", "calls>", "ms a call>", "what")
+    for name, row in profile["categories"].items():
+        table.add_row(
+            name.replace("_", " "), _number(row["seconds"], 3), _percent(row["share"]), str(row["calls"] or "-"),
+            _number(row["ms_per_call"], 3), escape(row["what"]),
+        )
+    table.add_row("all", _number(profile["seconds"], 3))
+    console.print(Padding(table, (0, 0, 0, 4), expand=False))
+    spared = ", ".join(
+        f"{row['calls']} {name.replace('_', ' ')} {row['seconds']:.3f} s" for name, row in steps["avoidable"].items()
+    )
+    for line in (
+        f"steps: {steps['seconds']:.3f} s, of which elasticity, contact, assembly, factorisation and solves are "
+        f"{_percent(steps['kernels_share'])} ({spared})",
+        f"work that no method of this kind can avoid: {_percent(steps['unavoidable_share'])} ({steps['unavoidable']})",
+    ):
+        console.print(Padding(escape(line), (0, 0, 0, 4), expand=False))
 
 
 def _accuracy_line(accuracy: Mapping[str, Any]) -> str:
@@ -263,6 +289,10 @@ def _table(*titles: str) -> Table:
 
 def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def _console() -> Console:

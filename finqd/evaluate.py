@@ -44,7 +44,8 @@ class Evaluation:
     object_assumptions: what had to be assumed of the objects, one sentence each
     timings: wall-clock seconds; the only part, with each object's ``seconds`` and the estimate's, that differs between
     equal runs. "compile" is part of "simulation" (summed over processes): kernels compiled, or loaded from Numba's
-    cache. estimate: how far off the result is likely to be, if that was asked for
+    cache. estimate: how far off the result is likely to be; profile: where the time went (`finqd.profiling.total`);
+    each if that was asked for
     """
 
     design: Design
@@ -58,6 +59,7 @@ class Evaluation:
     timings: Mapping[str, float] = field(compare=False)
     object_assumptions: tuple[str, ...] = ()
     estimate: Estimate | None = None
+    profile: Mapping[str, Any] | None = field(default=None, compare=False)
 
     @property
     def fitness(self) -> float:
@@ -72,13 +74,14 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON holds it."""
         estimate = {} if self.estimate is None else {"estimate": self.estimate.to_dict()}
+        profile = {} if self.profile is None else {"profile": dict(self.profile)}
         return {
             "format": "finqd result", "design": self.design.resolved(), "digest": self.design.digest(),
             "preset": self.preset, "accuracy": accuracy(self.design, self.preset), "status": self.status,
             "reason": self.reason, "fitness": self.fitness, "margin": self.margin, **estimate,
             "features": dict(self.features),
             "objects": {name: self._row(name, trajectory) for name, trajectory in self.trajectories.items()},
-            "mesh": dict(self.mesh), "timings": dict(self.timings), "effects": effects_of(self.design),
+            "mesh": dict(self.mesh), "timings": dict(self.timings), **profile, "effects": effects_of(self.design),
             "reductions": reductions_of(self.design),
             "assumptions": [*ASSUMPTIONS, *self.object_assumptions, *self.design.warnings],
             "versions": dict(versions()),
@@ -108,15 +111,15 @@ def evaluate(
     design: Design, *, objects: Sequence[str | Path | GraspObject] | None = None, preset: str = "standard",
     overrides: Mapping[str, Any] | None = None, jobs: int = 1, record: Path | None = None,
     progress: Callable[[str, float], None] | None = None, estimate_error: bool = False,
-    checkpoints: Path | None = None,
+    checkpoints: Path | None = None, profile: bool = False,
 ) -> Evaluation:
     """Build ``design``, mesh it, close it on every object (default: the ten that come with finqd), and score it.
 
     overrides: design values by JSON path, stronger than ``preset``; jobs: grasps side by side; record: folder for
     ParaView files; progress: called with object name and share done; estimate_error: simulate again one level away in
     mesh and in time step, and say how far off the result is (`finqd.estimate`); checkpoints: folder in which each grasp
-    is kept as it goes on, and from which one that was stopped goes on. Raises InputError for bad input; whatever fails
-    in mesh or simulation is in the result.
+    is kept as it goes on, and from which one that was stopped goes on; profile: note where the time goes, in all grasps
+    but the estimate's. Raises InputError for bad input; whatever fails in mesh or simulation is in the result.
     """
     begun = clock.perf_counter()
     chosen = apply_preset(design, preset, overrides=overrides)
@@ -138,7 +141,7 @@ def evaluate(
     if status == "ok":
         tasks = [
             GraspTask(
-                design=chosen, meshes=meshes, grasped=g, record=record is not None,
+                design=chosen, meshes=meshes, grasped=g, record=record is not None, profile=profile,
                 checkpoint=None if checkpoints is None else Path(checkpoints) / f"{g.name}.npz",
             )
             for g in grasped
@@ -154,8 +157,17 @@ def evaluate(
         design=chosen, preset=preset, status=status, reason=reason, result=chosen.plugin("fitness").score(trajectories),
         features=features, trajectories=trajectories, mesh=mesh, timings=timings,
         object_assumptions=tuple(sentence for g in grasped for sentence in g.assumptions),
+        profile=_profile(trajectories, timings) if profile else None,
     )
     return _with_estimate(evaluation, grasped, jobs=jobs, progress=progress) if estimate_error else evaluation
+
+
+def _profile(trajectories: Mapping[str, Trajectory], timings: Mapping[str, float]) -> dict[str, Any]:
+    from finqd.profiling import total
+
+    return total(
+        [trajectory.timings for trajectory in trajectories.values()], set_up=timings["geometry"], mesh=timings["mesh"]
+    )
 
 
 def _with_estimate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from finqd.design import Design
     from finqd.mesh import Mesh
     from finqd.objects import GraspObject
+    from finqd.profiling import Profile
     from finqd.protocol import GraspProtocol
 
 FLOOR = "floor"
@@ -39,6 +40,7 @@ class GraspTask:
 
     meshes: one a finger, in the finger frame [m]
     checkpoint: file that the simulation is kept in, and goes on from (see `finqd.simulate.simulate`)
+    profile: whether the trajectory's timings say where the time went (see `finqd.profiling`)
     """
 
     design: Design
@@ -46,6 +48,7 @@ class GraspTask:
     grasped: GraspObject
     record: bool = False
     checkpoint: Path | None = None
+    profile: bool = False
 
 
 def lift_start(protocol: GraspProtocol) -> float:
@@ -170,12 +173,23 @@ def simulate_grasp(task: GraspTask, *, progress: Callable[[float], None] | None 
 
     The trajectory's timings hold "compile" too: what of the other timings went into compiling or loading kernels.
     """
-    with compile_clock() as compiled:
-        trajectory = _simulated(task, progress)
-        return replace(trajectory, timings={**trajectory.timings, "compile": compiled()})
+    with compile_clock() as compiled, _profile_of(task) as profile:
+        trajectory = _simulated(task, progress, profile)
+        own = {} if profile is None else profile.timings()
+        return replace(trajectory, timings={**trajectory.timings, "compile": compiled(), **own})
 
 
-def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Trajectory:
+def _profile_of(task: GraspTask) -> AbstractContextManager[Profile | None]:
+    if not task.profile:
+        return nullcontext()
+    from finqd.profiling import profiled
+
+    return profiled()
+
+
+def _simulated(
+    task: GraspTask, progress: Callable[[float], None] | None, profile: Profile | None
+) -> Trajectory:
     design = with_effects(task.design)
     protocol = design.protocol
     scene = grasp_scene(task)
@@ -187,6 +201,7 @@ def _simulated(task: GraspTask, progress: Callable[[float], None] | None) -> Tra
         stepper=design.plugin("stepper"), contact=design.plugin("contact"), record=task.record,
         wall_clock_limit=protocol.si("wall_clock_limit_s"), progress=progress, checkpoint=task.checkpoint,
         longest_step=protocol.calm_step_factor, decided=early_verdict(design) if protocol.early_verdict else None,
+        profile=profile,
     )
     return replace(
         trajectory, effects=_effects(scene, task, trajectory), object_name=task.grasped.name, protocol=protocol,

@@ -22,6 +22,7 @@ from finqd.step_control import JUMP, StepControl, Timetable, happened, hasty, wa
 from finqd.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from finqd.profiling import Profile
     from finqd.scene import Scene
 #: asked at a frame: system, state, and by name what has been recorded of all frames so far
 Decided = Callable[[System, State, Mapping[str, Sequence[Any]]], str]
@@ -233,6 +234,7 @@ def simulate(
     record: bool = False, wall_clock_limit: float = math.inf, progress: Callable[[float], None] | None = None,
     watch: Callable[[System, State], None] | None = None, checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: float = 10.0, longest_step: int = 1, decided: Decided | None = None,
+    profile: Profile | None = None,
 ) -> Trajectory:
     """Run ``scene`` for ``duration`` [s] in steps of at most ``time_step`` [s].
 
@@ -244,7 +246,8 @@ def simulate(
     longest_step: time steps that one may span where nothing happens: no contact begins or ends, its forces hardly
     change, and no drive begins or ends. A long step in which something does happen is taken back, and gone through in
     single ones. decided: asked at every frame; it returns why the rest need not be simulated, or nothing. The
-    trajectory then ends there, with that sentence as ``ended``.
+    trajectory then ends there, with that sentence as ``ended``. profile: of `finqd.profiling.profiled`, to note where
+    the time goes; no result depends on it.
     A step that fails is halved, up to 2^-8, then the run ends with status ``diverged``; a run that takes longer than
     ``wall_clock_limit`` [s] ends with status ``timeout``. A stepper that estimates its error chooses its steps itself,
     within the same bounds; then ``time_step`` is only how often a frame is kept. Raises InputError for numbers that
@@ -276,6 +279,8 @@ def simulate(
     if keeper is None or not keeper.restore(run):
         run.start()
     set_up = clock.perf_counter() - begun
+    if profile is not None:
+        profile.watch(run, keeper)
 
     def after_step() -> None:
         if keeper is not None:

@@ -61,9 +61,10 @@ class Trajectory:
     soft_positions: [m], (n_recorded, n_vertices, 3), at recorded_times [s], (n_recorded,): empty without recording
     counters: steps, rejected_steps, newton_iterations, line_search_steps, factorisations, cg_iterations, ...
     object_drop: how far the object fell relative to the gripper [m], NaN if unknown
-    protocol: constants of the grasp, None for other scenes; timings: name -> seconds
+    protocol: constants of the grasp, None for other scenes; timings: name -> seconds, or what `finqd.profiling`
+        left there
     effects: of a grasp, name -> since when and why (`finqd.effects.effects_seen`); of other scenes "met", pairs of
-    bodies and when they first came within reach of each other [s]
+        bodies and when they first came within reach of each other [s]
     """
 
     status: str

@@ -48,9 +48,9 @@ class FakeEvaluate:
     def __init__(self):
         self.calls, self.error, self.result = [], None, RESULT
 
-    def __call__(self, design, *, objects, preset, jobs, record, progress, estimate_error, checkpoints):
+    def __call__(self, design, *, objects, preset, jobs, record, progress, estimate_error, checkpoints, profile):
         call = {"design": design, "objects": objects, "preset": preset, "jobs": jobs, "record": record}
-        self.calls.append({**call, "estimate_error": estimate_error, "checkpoints": checkpoints})
+        self.calls.append({**call, "estimate_error": estimate_error, "checkpoints": checkpoints, "profile": profile})
         progress("sphere", 0.5)
         if self.error is not None:
             raise self.error
@@ -86,6 +86,7 @@ def test_evaluate_prints_a_row_an_object_with_its_numbers_and_the_reason_of_a_fa
     assert "fitness 0.333 (1 of 3 held), margin -0.337" in out
     assert "\naccuracy of the preset standard: not measured yet\n" in out
     assert "uncertain" not in out and "+-" not in out and not evaluated.calls[0]["estimate_error"]
+    assert "profile" not in out and not evaluated.calls[0]["profile"]
     for text in ("workspace_mm2 = 2078.46", "mu is 0.6", "friction = on", "elements.hex8 = 900"):
         assert text in out
     assert "sphere: done" in err and "15 lies outside the search range 20 to 30" in err
@@ -143,9 +144,10 @@ def test_quiet_prints_no_table_and_no_progress(run, evaluated):
 def test_evaluate_passes_on_what_was_typed(run, evaluated, tmp_path):
     code, _, _ = run(
         "evaluate", "benchmark", "--objects", "sphere, cube", "--objects", "disk", "--jobs", "2", "--preset", "draft",
-        "--set", "protocol.hold_s=2.5", "--set", "mesher=tetrahedral", "--record", tmp_path / "a" / "b",
+        "--set", "protocol.hold_s=2.5", "--set", "mesher=tetrahedral", "--record", tmp_path / "a" / "b", "--profile",
     )
     (call,) = evaluated.calls
+    assert call["profile"]
     assert code == 0 and call["objects"] == ["sphere", "cube", "disk"]
     assert (call["jobs"], call["preset"], call["record"]) == (2, "draft", tmp_path / "a" / "b")
     assert call["design"].protocol.hold_s == 2.5 and call["design"].spec("mesher")["name"] == "tetrahedral"
