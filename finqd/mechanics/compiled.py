@@ -21,7 +21,7 @@ from typing import IO, Any
 LOCK_WAIT_S = 300.0  # for another process to compile a kernel; the largest takes half a minute on a slow core
 LOCK_POLL_S = 0.02
 
-_kernels: list[Any] = []  # that this process knows, compiled or not
+_kernels: list[Any] = []  # that have been decorated
 _locked: set[Path] = set()  # by this process; Numba's compiler lock guards it
 
 
@@ -45,6 +45,11 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return kernel
 
     return compiled
+
+
+def kernels() -> tuple[Any, ...]:
+    """Return the kernels that this process knows, Numba's dispatchers, compiled or not."""
+    return tuple(_kernels)
 
 
 def kernel_counts() -> tuple[int, int]:
