@@ -26,8 +26,9 @@ def calling(x):
 
 #: asks for a kernel once another process is at compiling it; that one goes on only when this one has asked
 ASKING = """import pathlib, sys, time
-import numba.core.event as event
+import numba, numba.core.event as event
 import compiled, calling_kernels
+numba.njit(lambda x: x + 1.0)(1.0)  # the compiler takes a second to begin with
 own, other = map(pathlib.Path, sys.argv[1:])
 def met():
     own.touch()
@@ -37,6 +38,7 @@ class Meeting(event.Listener):
     def on_start(self, event):
         if {first}:
             met()
+            time.sleep(0.5)  # and so the other one has looked for the kernel, in vain
     def on_end(self, event):
         pass
 event.register("numba:compile", Meeting())
