@@ -35,7 +35,8 @@ BLOCK = np.array([8.0, 8.0, 8.0]) * MM
 BOX_MM = 12.0
 NEAR = 0.2 * MM  # between what is to touch: the first step goes through the air, as that of a grasp
 STROKE = 0.4 * MM
-STEP = 2.0 * MS  # explicit steppers divide them by thousands
+STEP = 2.0 * MS
+SHORT_STEP = 0.1 * STEP  # for other plugins than the preset's: explicit steppers divide it by hundreds
 SMOOTH, ROUGH = 10, 2  # steps of the motion: as small as those of a grasp, and too large for single precision
 LIMIT_S = 10.0  # for the scene with another plugin than the preset's, which may not be to its liking
 
@@ -121,7 +122,10 @@ def _families(design: Design, *, everything: bool) -> Iterator[tuple[str, Design
     """Yield the names of families of kernels, each with a design that uses it."""
     chosen = {kind: design.spec(kind)["name"] for kind in KINDS}
     yield ", ".join(chosen.values()), design
-    for kind in KINDS if everything else ():
+    if not everything:
+        return
+    yield "damping", design.with_overrides({"material.rayleigh_stiffness_ms": 1.0, "material.rayleigh_mass_per_s": 1.0})
+    for kind in KINDS:
         for name in registry.names(kind):
             if name != chosen[kind]:
                 yield f"{kind} {name}", Design({**design.to_dict(), kind: name})
@@ -132,13 +136,13 @@ def _press_often(design: Design) -> None:
     known = None
     while known != kernel_counts():
         known = kernel_counts()
-        _press(design, SMOOTH, limit=LIMIT_S)
+        _press(design, SMOOTH, step=SHORT_STEP, limit=LIMIT_S)
 
 
-def _press(design: Design, steps: int, *, limit: float = math.inf) -> None:
+def _press(design: Design, steps: int, *, step: float = STEP, limit: float = math.inf) -> None:
     """Go through the motion of `_scene`, and a quarter as many steps after it; how that ends does not matter."""
     simulate(
-        _scene(design, STEP * steps), duration=STEP * (steps + -(-steps // 4)), time_step=STEP,
+        _scene(design, step * steps), duration=step * (steps + -(-steps // 4)), time_step=step,
         stepper=design.plugin("stepper"), contact=design.plugin("contact"),
         longest_step=design.protocol.calm_step_factor, wall_clock_limit=limit,
     )

@@ -70,8 +70,9 @@ def test_all_is_every_other_plugin_that_has_kernels_once() -> None:
     others = {f"{kind} {name}" for kind in KINDS for name in registry.names(kind)} - {
         "elasticity corotated", "contact penalty", "stepper implicit_euler"
     }
-    assert {name for name, _ in found[1:]} == others and len(found) == 1 + len(others)
-    assert all(name == f"{kind} {chosen.spec(kind)['name']}" for name, chosen in found[1:] for kind in name.split()[:1])
+    assert found[1][0] == "damping" and found[1][1].material.rayleigh_stiffness > 0.0
+    assert {name for name, _ in found[2:]} == others and len(found) == 2 + len(others)
+    assert all(name == f"{kind} {chosen.spec(kind)['name']}" for name, chosen in found[2:] for kind in name.split()[:1])
 
 
 @COMPILES
