@@ -99,7 +99,6 @@ def evaluate(
     """Build a gripper, close it on every object in a simulation, and say which it holds."""
     from finqd.cli_files import usable_folder, written_at_end
     from finqd.cli_progress import shown_progress
-    from finqd.cli_tables import print_evaluation
 
     chosen = _read_design(design, settings, preset)
     objects = [*_split(object_names), *_read_surfaces(surfaces, mass_g)] or None
@@ -113,6 +112,8 @@ def evaluate(
         )
         write(json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
     if not quiet:
+        from finqd.cli_tables import print_evaluation  # not in the way of the first step
+
         print_evaluation(result.to_dict())
 
 
@@ -226,6 +227,24 @@ def designs() -> None:
     from finqd.cli_tables import print_designs
 
     print_designs()
+
+
+@finqd.command()
+@_preset_option
+@click.option("--all", "everything", is_flag=True, help="Those of all other plugins that are installed, too.")
+@click.option("--quiet", is_flag=True, help="Print nothing but what goes wrong.")
+def warmup(preset: str, everything: bool, quiet: bool) -> None:
+    """Compile the kernels that evaluations use, and keep them on disk.
+
+    An evaluation does so too, the first time; afterwards, every process of this machine loads them.
+    """
+    from finqd.warmup import warm_up
+
+    say = (lambda line: None) if quiet else click.echo
+    done = warm_up(preset, everything=everything, report=say)
+    compiled, loaded = sum(family.compiled for family in done), sum(family.loaded for family in done)
+    seconds = sum(family.seconds for family in done)
+    say(f"{compiled} kernels compiled, {loaded} loaded in {seconds:.1f} s; they are in {done[0].folder}")
 
 
 @finqd.command()

@@ -10,7 +10,6 @@ Sources: Henshell and Shaw, Int. J. Numer. Methods Eng. 9 (1975) 495; Barsoum, I
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 
 from finqd.mesh import Mesh
 from finqd.mesh_reference import MID_EDGES
@@ -25,11 +24,29 @@ def notch_vertices(mesh: Mesh, *, angle: float = REENTRANT) -> np.ndarray:
 
     Mid-edge nodes are not among them: the boundary is looked at as flat triangles between corners.
     """
-    surface = trimesh.Trimesh(mesh.vertices, mesh.surface_triangles(), process=False)
-    notch = ~surface.face_adjacency_convex & (surface.face_adjacency_angles > angle - np.pi)
+    triangles = mesh.surface_triangles()
+    corners = mesh.vertices[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    edges, one, other = _shared_edges(triangles)
+    bend = np.arccos(np.clip(np.einsum("ij,ij->i", normals[one // 3], normals[other // 3]), -1.0, 1.0))
+    beyond = mesh.vertices[triangles.ravel()[other]] - mesh.vertices[edges[:, 0]]  # to the other triangle's corner
+    inwards = np.einsum("ij,ij->i", normals[one // 3], beyond) > 0.0
     found = np.zeros(mesh.n_vertices, dtype=bool)
-    found[surface.face_adjacency_edges[notch]] = True
+    found[edges[inwards & (bend > angle - np.pi)]] = True
     return found
+
+
+def _shared_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the edges (n, 2) that two triangles share, and the corner opposite to each in both, by 3 triangle + k.
+
+    An edge at which more than two meet, where a body touches itself, is not among them.
+    """
+    sides = np.sort(triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
+    edges, which, counts = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    first = (np.cumsum(counts) - counts)[counts == 2]
+    return edges[counts == 2], order[first], order[first + 1]
 
 
 def with_quarter_nodes(mesh: Mesh) -> Mesh:

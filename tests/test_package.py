@@ -44,6 +44,39 @@ def test_help_loads_nothing_heavy(arguments):
     assert not modules & HEAVY
 
 
+#: a block that falls on the floor, by the plugins of a preset, with all that an evaluation imports
+TINY = """
+import finqd.evaluate
+from finqd.data import designs_folder
+from finqd.design import Design
+from finqd.mesh_shapes import box_mesh
+from finqd.presets import apply_preset
+from finqd.scene import Scene
+from finqd.simulate import simulate
+
+design = apply_preset(Design.from_json(designs_folder() / "benchmark.json"), "draft")
+for kind in ("geometry", "mesher", "actuation", "fitness", "features"):
+    assert design.plugin(kind)
+scene = Scene()
+scene.add_soft(box_mesh((0.01, 0.01, 0.01), (1, 1, 1)), design.material, elasticity=design.plugin("elasticity"))
+scene.add_plane(point=(0.0, 0.0, -1e-4))
+found = simulate(scene, duration=0.01, time_step=0.005, stepper=design.plugin("stepper"),
+                 contact=design.plugin("contact"))
+assert found.status == "ok" and len(found.times) == 3
+"""
+
+
+def test_an_evaluation_loads_no_effect_and_no_library_that_it_does_not_use():
+    program = f"import sys\n{TINY}\nprint('\\n'.join(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    others = ("ipc", "explicit", "imex", "bdf2", "quasi_static", "neo_hookean", "condensation", "elasticity_linear")
+    own = {name.rpartition(".")[2] for name in loaded if name.startswith("finqd.")}
+    assert {"contact_penalty", "contact_kernels", "corotated_kernels"} <= own
+    assert not [name for name in own if any(word in name for word in others)]
+    unused = {"trimesh", "networkx", "gmsh", "ipctk", "matplotlib", "meshio", "ribs", "rich", "shapely"}
+    assert not unused & {name.partition(".")[0] for name in loaded}
+
+
 def test_every_public_name_is_there_once_and_loads():
     assert len(set(finqd.__all__)) == len(finqd.__all__)
     for name in finqd.__all__:

@@ -14,11 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property, partial
 from itertools import product
 
 import numpy as np
-from scipy.special import roots_jacobi
 
 from finqd.errors import InputError
 
@@ -29,21 +28,33 @@ Rule = tuple[np.ndarray, np.ndarray]  # points (q, d), weights (q,)
 class Element:
     """A reference element or face: ``nodes`` (k, d), monomial ``exponents`` (k, d), quadrature ``points``, ``weights``.
 
-    The quadrature is the one for stiffness; `element_rule` gives exact ones of any degree. ``faces``: (face type, local
-    nodes, counter-clockwise seen from outside) of each face. ``corners``: how many nodes are corners.
+    The quadrature is the one for stiffness, by ``rule``, which is called when it is first asked for; `element_rule`
+    gives exact ones of any degree. ``faces``: (face type, local nodes, counter-clockwise seen from outside) of each
+    face. ``corners``: how many nodes are corners.
     """
 
     name: str
     nodes: np.ndarray
     exponents: np.ndarray
-    points: np.ndarray
-    weights: np.ndarray
+    rule: Callable[[], Rule]
     corners: int
     faces: tuple[tuple[str, tuple[int, ...]], ...] = ()
     coefficients: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "coefficients", np.linalg.inv(_monomials(self.nodes, self.exponents)))
+
+    @cached_property
+    def _quadrature(self) -> Rule:
+        return self.rule()
+
+    @property
+    def points(self) -> np.ndarray:
+        return self._quadrature[0]
+
+    @property
+    def weights(self) -> np.ndarray:
+        return self._quadrature[1]
 
     @property
     def n_nodes(self) -> int:
@@ -84,6 +95,8 @@ def simplex_rule(n: int, dimension: int) -> Rule:
 
     Source: Stroud, Approximate calculation of multiple integrals, 1971 (Gauss-Jacobi in collapsed coordinates).
     """
+    from scipy.special import roots_jacobi  # takes longer to import than all the rest here, and bricks need none
+
     points, weights, rest = np.zeros((1, 0)), np.ones(1), np.ones(1)
     for axis in range(dimension):
         power = dimension - 1 - axis
@@ -160,16 +173,16 @@ _WEDGE_FACES = _faces("tri3", ((0, 2, 1), (3, 4, 5))) + _faces("quad4", ((0, 1, 
 ELEMENTS: dict[str, Element] = {
     e.name: e
     for e in (
-        Element("hex8", np.array(_HEX, float), _powers(3, 1, lambda e: True), *box_rule(2, 3), 8,
+        Element("hex8", np.array(_HEX, float), _powers(3, 1, lambda e: True), partial(box_rule, 2, 3), 8,
                 _faces("quad4", _HEX_FACES)),
-        Element("hex20", _between(_HEX, _HEX_EDGES), _powers(3, 2, lambda e: _superlinear(e) <= 2), *box_rule(2, 3), 8,
-                _faces("quad8", _with_edge_nodes(_HEX_FACES, _HEX_EDGES, 8))),
-        Element("wedge6", np.array(_WEDGE, float), _powers(3, 1, lambda e: e[0] + e[1] <= 1), *wedge_rule(2), 6,
+        Element("hex20", _between(_HEX, _HEX_EDGES), _powers(3, 2, lambda e: _superlinear(e) <= 2),
+                partial(box_rule, 2, 3), 8, _faces("quad8", _with_edge_nodes(_HEX_FACES, _HEX_EDGES, 8))),
+        Element("wedge6", np.array(_WEDGE, float), _powers(3, 1, lambda e: e[0] + e[1] <= 1), partial(wedge_rule, 2), 6,
                 _WEDGE_FACES),
-        Element("tet4", np.array(_TET, float), _powers(3, 1, lambda e: sum(e) <= 1), *simplex_rule(1, 3), 4,
+        Element("tet4", np.array(_TET, float), _powers(3, 1, lambda e: sum(e) <= 1), partial(simplex_rule, 1, 3), 4,
                 _faces("tri3", _TET_FACES)),
-        Element("tet10", _between(_TET, _TET_EDGES), _powers(3, 2, lambda e: sum(e) <= 2), *_symmetric_simplex_rule(3),
-                4, _faces("tri6", _with_edge_nodes(_TET_FACES, _TET_EDGES, 4))),
+        Element("tet10", _between(_TET, _TET_EDGES), _powers(3, 2, lambda e: sum(e) <= 2),
+                partial(_symmetric_simplex_rule, 3), 4, _faces("tri6", _with_edge_nodes(_TET_FACES, _TET_EDGES, 4))),
     )
 }
 
@@ -177,11 +190,13 @@ ELEMENTS: dict[str, Element] = {
 FACES: dict[str, Element] = {
     e.name: e
     for e in (
-        Element("quad4", np.array(_QUAD, float), _powers(2, 1, lambda e: True), *box_rule(2, 2), 4),
-        Element("quad8", _between(_QUAD, _QUAD_EDGES), _powers(2, 2, lambda e: _superlinear(e) <= 2), *box_rule(3, 2),
-                4),
-        Element("tri3", np.array(_TRI, float), _powers(2, 1, lambda e: sum(e) <= 1), *_symmetric_simplex_rule(2), 3),
-        Element("tri6", _between(_TRI, _TRI_EDGES), _powers(2, 2, lambda e: sum(e) <= 2), *simplex_rule(3, 2), 3),
+        Element("quad4", np.array(_QUAD, float), _powers(2, 1, lambda e: True), partial(box_rule, 2, 2), 4),
+        Element("quad8", _between(_QUAD, _QUAD_EDGES), _powers(2, 2, lambda e: _superlinear(e) <= 2),
+                partial(box_rule, 3, 2), 4),
+        Element("tri3", np.array(_TRI, float), _powers(2, 1, lambda e: sum(e) <= 1),
+                partial(_symmetric_simplex_rule, 2), 3),
+        Element("tri6", _between(_TRI, _TRI_EDGES), _powers(2, 2, lambda e: sum(e) <= 2),
+                partial(simplex_rule, 3, 2), 3),
     )
 }
 
