@@ -200,13 +200,13 @@ def report(rows: list[dict[str, Any]], name: str) -> None:
     for case in cases:
         mine = [row for row in whole if tuple(row["case"]) == case]
         if mine:
-            per = [statistics.median(row["stepping_s"] / row[key] for row in mine) for key in ("steps", "all", "newton")]
+            per = [statistics.median(row["stepping_s"] / row[key] for row in mine)
+                   for key in ("steps", "all", "newton")]
             once = [statistics.median(row.get(key, math.nan) for row in mine)
                     for key in ("set_up_s", "load_s", "rounded_s")]
             table.append((mine[0], per, once))
     print(f"\n{name}: rows {commits(whole)}; solver {available_backends()[0]}; seconds of processor time")
-    print(f"{against:>10s} {'contacts':>8s} {'steps':>5s} {'Newton':>6s} {'all':>5s} | {'a step':>8s} {'iteration':>9s} "
-          f"{'Newton it.':>10s} | {'set-up':>7s} {'load':>7s} {'round':>7s}")
+    print(f"{against:>10s} contacts steps Newton   all |   a step iteration Newton it. |  set-up    load   round")
     for row, per, once in table:
         print(f"{row[against]:10d} {row['contacts']:8d} {row['steps']:5d} {row['newton']:6d} {row['all']:5d} | "
               f"{per[0]:8.4f} {per[1]:9.4f} {per[2]:10.4f} | {once[0]:7.2f} {once[1]:7.2f} {once[2]:7.2f}")
@@ -215,7 +215,8 @@ def report(rows: list[dict[str, Any]], name: str) -> None:
         fits = [np.polyfit(sizes, np.log([per[i] for _, per, _ in table]), 1)[0] for i in range(3)]
         ends = [table[-1][1][i] / table[0][1][i] for i in range(3)]
         for title, values in (("exponents", fits), ("last over first", ends)):
-            print(f"  {title}: {values[0]:.2f} a step, {values[1]:.2f} an iteration, {values[2]:.2f} a Newton iteration")
+            step, every, newton = values
+            print(f"  {title}: {step:.2f} a step, {every:.2f} an iteration, {newton:.2f} a Newton iteration")
 
 
 def main() -> None:
