@@ -92,10 +92,10 @@ def _key(kind: str, parts: Sequence[Part]) -> str:
     digest = hashlib.sha256()
     for part in (kind, _circumstances(), *parts):
         if isinstance(part, np.ndarray):
-            head, body = f"{part.dtype.str} {part.shape}", np.ascontiguousarray(part).tobytes()
+            head, body = f"{part.dtype.str} {part.shape}", np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
         else:
-            head, body = type(part).__name__, part if isinstance(part, bytes) else repr(part).encode()
-        digest.update(f"{head} {len(body)};".encode())
+            head, body = type(part).__name__, memoryview(part if isinstance(part, bytes) else repr(part).encode())
+        digest.update(f"{head} {len(body)};".encode())  # so that no two lists of parts run together into one
         digest.update(body)
     return digest.hexdigest()
 

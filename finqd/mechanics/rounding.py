@@ -63,6 +63,7 @@ def rounded_field(solid: RigidShape, radius: float) -> DistanceField:
 
 
 def _rounded(solid: RigidShape, radius: float) -> DistanceField:
+    """Return what `rounded_field` does of a body that is no ball."""
     smaller = _smaller_lathes(solid, radius) if solid.distance.kind == REVOLUTION else _smaller_surfaces(solid, radius)
     for tried, found in smaller:
         if found is not None:
