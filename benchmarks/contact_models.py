@@ -11,20 +11,18 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from checkout import commit, commits
+from checkout import commits
+from study import compute_missing, rows_that_hold
 
 from finqd.data import designs_folder
 from finqd.design import Design, design_parameters
 from finqd.evaluate import evaluate
 from finqd.objects import object_names
 from finqd.presets import apply_preset
-from finqd.study_log import append_row, read_rows
-from finqd.workers import TaskFailure, run_tasks
 
 SEED = 5
 DRAWN = 2  # designs, beside the benchmark's
@@ -49,11 +47,9 @@ def tasks() -> dict[Key, Design]:
     }
 
 
-def simulate(task: tuple[Key, Design, float]) -> dict[str, Any] | None:
-    """Return a row of the log, None if the time is up."""
-    (design, name, model), ready, deadline = task
-    if time.time() > deadline:
-        return None
+def simulate(task: tuple[Key, Design]) -> dict[str, Any]:
+    """Return a row of the log."""
+    (design, name, model), ready = task
     row = evaluate(ready, objects=[name], preset=PRESET).to_dict()["objects"][name]
     forces = row["final_contact_force_N"]
     kept = ("status", "reason", "held", "drop_mm", "max_penetration_mm", "seconds", "newton_iterations")
@@ -63,35 +59,25 @@ def simulate(task: tuple[Key, Design, float]) -> dict[str, Any] | None:
     }
 
 
-def read_log(log: Path, wanted: dict[Key, Design]) -> dict[Key, dict[str, Any]]:
-    """Return the rows that still hold."""
-    rows = {}
-    for row in read_rows(log):
-        key = row["design"], row["object"], row["contact"]
-        if key in wanted and wanted[key].digest() == row["digest"]:
-            rows[key] = row
-    return rows
+def key(row: dict[str, Any]) -> Key:
+    """Return which simulation a row is of."""
+    return row["design"], row["object"], row["contact"]
+
+
+def words(row: dict[str, Any]) -> str:
+    """Return a row in words."""
+    force = "-" if row["force_N"] is None else f"{row['force_N']:.2f} N"
+    held = "held" if row["held"] else "lost"
+    return " ".join((*key(row), row["status"], held, force, f"{row['seconds']:.0f} s"))
 
 
 def run(arguments: argparse.Namespace) -> dict[Key, dict[str, Any]]:
-    """Simulate what the log does not hold yet, until the time is up; return all rows."""
-    log, wanted = Path(arguments.log), tasks()
-    rows, source = read_log(log, wanted), commit()
-    deadline = time.time() + 60.0 * arguments.minutes
-    left = [(key, design, deadline) for key, design in wanted.items() if key not in rows]
-
-    def on_result(position: int, row: Any) -> None:
-        key = left[position][0]
-        if isinstance(row, TaskFailure):
-            print(*key, row.kind, row.reason, flush=True)
-        elif row is not None:
-            rows[key] = {**row, "commit": source}
-            append_row(log, rows[key])
-            force = "-" if row["force_N"] is None else f"{row['force_N']:.2f} N"
-            print(*key, row["status"], "held" if row["held"] else "lost", force, f"{row['seconds']:.0f} s", flush=True)
-
+    """Simulate what the log does not hold yet, until the time is up; return all rows that hold."""
+    wanted = tasks()
+    rows = rows_that_hold(arguments.log, {one: design.digest() for one, design in wanted.items()}, key)
     if not arguments.report:
-        run_tasks(simulate, left, jobs=arguments.jobs, on_result=on_result)
+        compute_missing({one: (one, design) for one, design in wanted.items()}, rows, simulate, log=arguments.log,
+                        words=words, jobs=arguments.jobs, minutes=arguments.minutes)
     return rows
 
 
@@ -126,7 +112,7 @@ def report(rows: dict[Key, dict[str, Any]]) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--log", required=True)
+    parser.add_argument("--log", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=math.inf)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--report", action="store_true", help="only print what the log holds")

@@ -13,20 +13,18 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from checkout import commit, commits
+from checkout import commits
 from scipy.stats import qmc
+from study import compute_missing, rows_that_hold
 
 from finqd.design import Design, design_parameters
 from finqd.evaluate import evaluate
 from finqd.objects import object_names
 from finqd.presets import apply_preset
-from finqd.study_log import append_row, read_rows
-from finqd.workers import TaskFailure, run_tasks
 
 SEED = 6
 DESIGNS = 100
@@ -55,11 +53,9 @@ def tasks() -> dict[Key, Design]:
     }
 
 
-def simulate(task: tuple[Key, Design, float]) -> dict[str, Any] | None:
-    """Return a row of the log, None if the time is up."""
-    (design, name, way), ready, deadline = task
-    if time.time() > deadline:
-        return None
+def simulate(task: tuple[Key, Design]) -> dict[str, Any]:
+    """Return a row of the log."""
+    (design, name, way), ready = task
     row = evaluate(ready, objects=[name], preset=PRESET).to_dict()["objects"][name]
     forces = row["final_contact_force_N"]
     kept = ("status", "reason", "ended", "held", "drop_mm", "margin", "max_penetration_mm", "simulated_s", "seconds")
@@ -70,25 +66,24 @@ def simulate(task: tuple[Key, Design, float]) -> dict[str, Any] | None:
     }
 
 
+def key(row: dict[str, Any]) -> Key:
+    """Return which simulation a row is of."""
+    return row["design"], row["object"], row["way"]
+
+
+def words(row: dict[str, Any]) -> str:
+    """Return a row in words."""
+    held = "held" if row["held"] else "lost"
+    return f"{row['design']} {row['object']} {row['way']} {row['status']} {held} {row['seconds']:.0f} s"
+
+
 def run(arguments: argparse.Namespace) -> dict[Key, dict[str, Any]]:
     """Simulate what the log does not hold yet, until the time is up; return all rows that hold."""
-    wanted, source = tasks(), commit()
-    logged = {(row["design"], row["object"], row["way"]): row for row in read_rows(arguments.log)}
-    rows = {key: row for key, row in logged.items() if key in wanted and wanted[key].digest() == row["digest"]}
-    deadline = time.time() + 60.0 * arguments.minutes
-    left = [(key, design, deadline) for key, design in wanted.items() if key not in rows]
-
-    def on_result(position: int, row: Any) -> None:
-        key = left[position][0]
-        if isinstance(row, TaskFailure):
-            print(*key, row.kind, row.reason, flush=True)
-        elif row is not None:
-            rows[key] = {**row, "commit": source}
-            append_row(arguments.log, rows[key])
-            print(*key, row["status"], "held" if row["held"] else "lost", f"{row['seconds']:.0f} s", flush=True)
-
+    wanted = tasks()
+    rows = rows_that_hold(arguments.log, {one: design.digest() for one, design in wanted.items()}, key)
     if not arguments.report:
-        run_tasks(simulate, left, jobs=arguments.jobs, on_result=on_result)
+        compute_missing({one: (one, design) for one, design in wanted.items()}, rows, simulate, log=arguments.log,
+                        words=words, jobs=arguments.jobs, minutes=arguments.minutes)
     return rows
 
 

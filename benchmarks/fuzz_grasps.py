@@ -18,23 +18,22 @@ from __future__ import annotations
 import argparse
 import collections
 import math
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from checkout import commit, commits
+from checkout import commits
 from scipy.stats import qmc
+from study import compute_missing, rows_that_hold
 
 from finqd.design import Design, design_parameters
 from finqd.evaluate import evaluate
 from finqd.objects import object_names
 from finqd.presets import apply_preset
-from finqd.study_log import append_row, read_rows
 from finqd.trajectory import Trajectory
-from finqd.workers import TaskFailure, run_tasks
+from finqd.workers import TaskFailure
 
 SEED = 4
 CASES = {"draft": 1000, "standard": 200, "wild": 200}
@@ -96,11 +95,8 @@ def drawn(shares: np.ndarray) -> dict[str, float]:
     return values
 
 
-def simulate(task: tuple[Case, float]) -> dict[str, Any] | None:
-    """Simulate one case; return a row of the log, None if the time is up."""
-    case, deadline = task
-    if time.time() > deadline:
-        return None
+def simulate(case: Case) -> dict[str, Any]:
+    """Simulate one case; return a row of the log."""
     evaluation = evaluate(case.design, objects=[case.grasped], preset=case.preset)
     row = evaluation.to_dict()["objects"][case.grasped]
     kept = ("status", "reason", "held", "drop_mm", "max_penetration_mm", "max_contact_force_N", "seconds", "counters")
@@ -122,40 +118,30 @@ def is_finite(trajectory: Trajectory) -> bool:
     return all(bool(np.all(np.isfinite(values))) for values in arrays)
 
 
-def read_log(log: Path, wanted: list[Case]) -> dict[tuple[str, int], dict[str, Any]]:
-    """Return the rows that still hold."""
-    digests = {(case.suite, case.number): case.design.digest() for case in wanted}
-    rows = {}
-    for row in read_rows(log):
-        key = row["suite"], row["number"]
-        if digests.get(key) == row["digest"]:
-            rows[key] = row
-    return rows
+def key(row: dict[str, Any]) -> tuple[str, int]:
+    """Return which case a row is of."""
+    return row["suite"], row["number"]
+
+
+def words(row: dict[str, Any]) -> str:
+    """Return a row in words."""
+    return (f"{row['suite']} {row['number']} {row['object']}: {row['status']} {row['seconds']:.0f} s "
+            f"{row['reason']}")
 
 
 def run(arguments: argparse.Namespace, wanted: list[Case]) -> dict[tuple[str, int], dict[str, Any]]:
-    """Simulate what the log does not hold yet, until the time is up; return all rows."""
-    log = Path(arguments.log)
-    rows, source = read_log(log, wanted), commit()
-    deadline = time.time() + 60.0 * arguments.minutes
-    left = [case for case in wanted if (case.suite, case.number) not in rows]
+    """Simulate what the log does not hold yet, until the time is up; return all rows that hold."""
+    tasks = {(case.suite, case.number): case for case in wanted}
+    rows = rows_that_hold(arguments.log, {one: case.design.digest() for one, case in tasks.items()}, key)
 
-    def on_result(position: int, row: Any) -> None:
-        if row is None:
-            return
-        case = left[position]
-        if isinstance(row, TaskFailure):
-            kind = "hang" if row.kind == "timeout" else "crash"
-            row = {**named(case), "status": kind, "reason": row.reason, "finite": True, "held": False, "seconds": 0.0}
-        row["commit"] = source
-        rows[case.suite, case.number] = row
-        append_row(log, row)
-        print(f"{case.suite} {case.number} {case.grasped}: {row['status']} {row['seconds']:.0f} s {row['reason']}",
-              flush=True)
+    def failed(one: tuple[str, int], failure: TaskFailure) -> dict[str, Any]:
+        kind = "hang" if failure.kind == "timeout" else "crash"
+        return {**named(tasks[one]), "status": kind, "reason": failure.reason, "finite": True, "held": False,
+                "seconds": 0.0}
 
     if not arguments.report:
-        run_tasks(simulate, [(case, deadline) for case in left], jobs=arguments.jobs, on_result=on_result,
-                  time_limit_s=LIMIT_S + HANG_S)
+        compute_missing(tasks, rows, simulate, log=arguments.log, words=words, jobs=arguments.jobs,
+                        minutes=arguments.minutes, failed=failed, time_limit_s=LIMIT_S + HANG_S)
     return rows
 
 
@@ -185,7 +171,7 @@ def report(rows: list[dict[str, Any]], suite: str) -> None:
 def main() -> None:
     """Run the study as far as time allows, and report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--log", required=True)
+    parser.add_argument("--log", type=Path, required=True)
     parser.add_argument("--suites", default=",".join(CASES))
     parser.add_argument("--minutes", type=float, default=math.inf)
     parser.add_argument("--jobs", type=int, default=2)

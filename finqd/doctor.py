@@ -65,6 +65,7 @@ def examine() -> list[Finding]:
         Finding("processor", "ok", f"{_cores()} cores to use, {platform.machine()}"),
         _memory(),
         _kernel_cache(),
+        _cache(),
         _bundled_files(),
     ]
 
@@ -137,6 +138,19 @@ def _kernel_cache() -> Finding:
         return Finding("kernel cache", "ok", f"{folder.parent} is writable: kernels compile once")
     return Finding("kernel cache", "missing", f"{kernel_places()[-1]} is not writable, so kernels would compile in "
                    "every process; set NUMBA_CACHE_DIR")
+
+
+def _cache() -> Finding:
+    """Look for the folder in which meshes, distance fields and resting poses are kept."""
+    from finqd.cache import cache_folder, usable
+
+    folder = cache_folder()
+    if folder is None:
+        return Finding("cache", "optional", "switched off (FINQD_CACHE_DIR): meshes and fields are made in each run")
+    if usable(folder):
+        return Finding("cache", "ok", f"{folder}: meshes, distance fields and resting poses are made once")
+    return Finding("cache", "optional", f"{folder} is not writable: meshes and distance fields are made in each run; "
+                   "FINQD_CACHE_DIR names another folder")
 
 
 def _bundled_files() -> Finding:

@@ -135,6 +135,27 @@ class Mesh:
         return meshio.Mesh(self.vertices, cells, point_sets={k: np.asarray(v) for k, v in self.node_sets.items()})
 
 
+def mesh_arrays(mesh: Mesh) -> dict[str, np.ndarray]:
+    """Return a mesh, its boundary faces with it, as named arrays from which `mesh_of` makes it again."""
+    arrays = {"vertices": mesh.vertices, "face_sets": np.array(list(mesh.face_sets), dtype=str)}
+    for name, group in (("blocks", mesh.blocks), ("faces", mesh.faces), ("node_sets", mesh.node_sets)):
+        arrays |= {f"{name}/{key}": np.asarray(value) for key, value in group.items()}
+    for name, by_kind in mesh.face_sets.items():
+        arrays |= {f"face_set/{name}/{kind}": np.asarray(value) for kind, value in by_kind.items()}
+    return arrays
+
+
+def mesh_of(arrays: Mapping[str, np.ndarray]) -> Mesh:
+    """Return the mesh that `mesh_arrays` took apart. Raises KeyError if something is missing."""
+    def group(prefix: str) -> dict[str, np.ndarray]:
+        return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+
+    face_sets = {str(name): group(f"face_set/{name}/") for name in arrays["face_sets"]}
+    mesh = Mesh(arrays["vertices"], group("blocks/"), group("node_sets/"), face_sets)
+    mesh.__dict__["faces"] = group("faces/")
+    return mesh
+
+
 def _lonely(faces: np.ndarray, corners: int) -> np.ndarray:
     """Return the faces (n, nodes) that no other one shares its corners with, in their order."""
     keys = np.sort(faces[:, :corners], axis=1)

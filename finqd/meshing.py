@@ -2,7 +2,7 @@
 
 The child is started once and reused, by every thread and for every finger of this process; it is an ordinary
 subprocess, so that a worker of a process pool may have one too. What it has meshed is kept: identical fingers are
-meshed once.
+meshed once. What finqd's own meshers make is kept across runs too (`finqd.cache`); what others depend on is not known.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ import threading
 from collections import OrderedDict
 from typing import Any
 
+from finqd.cache import remembered
 from finqd.contracts import Mesher
 from finqd.errors import MeshError
-from finqd.mesh import Mesh
+from finqd.mesh import Mesh, mesh_arrays, mesh_of
 from finqd.meshing_child import read_message, write_message
 from finqd.solid import Solid
 
@@ -44,7 +45,7 @@ def mesh_solid(mesher: Mesher, solid: Solid, *, time_limit_s: float = 60.0, in_p
         if key in _meshes:
             _meshes.move_to_end(key)
             return _meshes[key]
-        mesh = _ask(payload, time_limit_s, type(mesher).__name__)
+        mesh = _made(mesher, payload, time_limit_s)
         _meshes[key] = mesh
         while len(_meshes) > _KEPT:
             _meshes.popitem(last=False)
@@ -107,6 +108,15 @@ class _Child:
                 pipe.close()  # type: ignore[union-attr]
             except OSError:  # what was not yet written is of no use to a killed child
                 continue
+
+
+def _made(mesher: Mesher, payload: bytes, time_limit_s: float) -> Mesh:
+    def make() -> Mesh:
+        return _ask(payload, time_limit_s, type(mesher).__name__)
+
+    if type(mesher).__module__.partition(".")[0] != __package__:
+        return make()
+    return remembered("mesh", [payload], make, pack=mesh_arrays, unpack=mesh_of)
 
 
 def _ask(payload: bytes, time_limit_s: float, name: str) -> Mesh:

@@ -13,14 +13,23 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge, Le
 
+from finqd.cache import remembered
 from finqd.errors import InputError
-from finqd.mechanics.distance import revolution_field, sphere_field, surface_field, triangle_neighbours
+from finqd.mechanics.distance import (
+    field_arrays,
+    field_of,
+    revolution_field,
+    sphere_field,
+    surface_field,
+    triangle_neighbours,
+)
 from finqd.mechanics.distance_kernels import DistanceField
 from finqd.mechanics.mass_properties import ball_moments, revolution_moments, surface_moments
 from finqd.options import checked, join, refuse_unknown, require_object, shown
 from finqd.units import MM
 
 SIZE_LOW, SIZE_HIGH = 1.0, 500.0  # largest extent of an object [mm]: beyond, its unit is probably another
+MANY = 1000  # triangles of a surface from which on its distance field is kept on disk: fewer are done in 20 ms
 AROUND = 96  # corners of a lathe's surface: for display and overlap tests, not for contact
 UNITS = {"mm": MM, "cm": 0.01, "m": 1.0, "in": 0.0254}
 
@@ -89,15 +98,15 @@ def solid_of_revolution(profile: np.ndarray) -> Shape:
 def solid_in_surface(vertices: np.ndarray, triangles: np.ndarray) -> Shape:
     """Return the solid inside a watertight, outward surface: vertices [m], shape (n, 3), triangles (m, 3)."""
     moments = surface_moments(vertices, triangles)
-    topology = triangle_neighbours(triangles)
     vertices = vertices - moments.centre
-    return Shape(
-        moments.volume,
-        moments.inertia,
-        vertices,
-        triangles,
-        surface_field(vertices, triangles, topology=topology),
-    )
+
+    def field() -> DistanceField:
+        return surface_field(vertices, triangles, topology=triangle_neighbours(triangles))
+
+    few = len(triangles) < MANY
+    distance = field() if few else remembered(
+        "surface field", [vertices, triangles], field, pack=field_arrays, unpack=field_of)
+    return Shape(moments.volume, moments.inertia, vertices, triangles, distance)
 
 
 def turned_surface(profile: np.ndarray, *, n_around: int) -> tuple[np.ndarray, np.ndarray]:

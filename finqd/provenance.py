@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,13 +14,18 @@ LIBRARIES = ("finqd", "numpy", "scipy", "numba", "gmsh", "qdldl", "mkl")
 @cache
 def versions() -> Mapping[str, str]:
     """Return the versions of finqd and of the libraries that can change a result, and ``source``: `source_digest`."""
+    return {**installed(LIBRARIES), "source": source_digest()}
+
+
+def installed(names: Iterable[str]) -> dict[str, str]:
+    """Return the versions of those distributions that are installed."""
     found = {}
-    for name in LIBRARIES:
+    for name in names:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return {**found, "source": source_digest()}
+    return found
 
 
 def source_digest() -> str:

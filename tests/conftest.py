@@ -22,6 +22,9 @@ from finqd import cli
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
+# What tests look at is made by the code that they test; `test_cache.py` looks at what the cache makes of it.
+os.environ["FINQD_CACHE_DIR"] = ""
+
 # Who starts the tests in the background of a script has SIGINT ignored, and every process below inherits that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

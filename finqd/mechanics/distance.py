@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,17 @@ def surface_field(
         boxes=_tree_boxes(corners, leaf_size),
         leaf_size=leaf_size,
     )
+
+
+def field_arrays(field: DistanceField) -> dict[str, np.ndarray]:
+    """Return a field as named arrays from which `field_of` makes it again."""
+    return {name: np.asarray(value) for name, value in field._asdict().items()}
+
+
+def field_of(arrays: Mapping[str, np.ndarray]) -> DistanceField:
+    """Return the field that `field_arrays` took apart. Raises KeyError if something is missing."""
+    given = {name: arrays[name] for name in DistanceField._fields}
+    return DistanceField(**{name: value if value.ndim else value.item() for name, value in given.items()})
 
 
 def triangle_normals(
