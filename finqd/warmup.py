@@ -109,7 +109,7 @@ def _told(report: Callable[[str], object]) -> Iterator[None]:
 
         def on_end(self, event: Any) -> None:
             seconds, kernel = clock.perf_counter() - began.pop(), event.data["dispatcher"]
-            if any(kernel is one for one in kernels()) and not event.is_failed:
+            if any(kernel is one for one in kernels()):
                 module = kernel.py_func.__module__.rpartition(".")[2]
                 report(f"compiled {module}.{kernel.py_func.__name__} in {seconds:.1f} s")
 

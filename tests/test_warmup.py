@@ -15,8 +15,9 @@ from finqd import registry
 from finqd.data import designs_folder
 from finqd.design import Design
 from finqd.errors import InputError
+from finqd.mechanics.compiled import njit
 from finqd.presets import apply_preset
-from finqd.warmup import KINDS, _families, warm_up
+from finqd.warmup import KINDS, _families, _told, warm_up
 
 BENCHMARK = Design.from_json(designs_folder() / "benchmark.json")
 
@@ -73,6 +74,24 @@ def test_all_is_every_other_plugin_that_has_kernels_once() -> None:
     assert found[1][0] == "damping" and found[1][1].material.rayleigh_stiffness > 0.0
     assert {name for name, _ in found[2:]} == others and len(found) == 2 + len(others)
     assert all(name == f"{kind} {chosen.spec(kind)['name']}" for name, chosen in found[2:] for kind in name.split()[:1])
+
+
+@COMPILES
+def test_every_kernel_that_is_compiled_is_told_of_when_it_is_done() -> None:
+    @njit()
+    def inner(x):
+        return 2.0 * x
+
+    @njit()
+    def outer(x):
+        return inner(x) + 1.0
+
+    told: list[str] = []
+    with _told(told.append):
+        assert outer(1.0) == outer(2.0) - 2.0
+    assert [re.sub(r"[\d.]+ s$", "", line) for line in told] == [
+        "compiled test_warmup.inner in ", "compiled test_warmup.outer in "
+    ]
 
 
 @COMPILES
