@@ -197,7 +197,10 @@ def test_rejected_steps_are_avoidable_as_a_whole():
     assert told["steps"]["unavoidable_share"] == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("stepper", ["implicit_euler", "bdf2", "quasi_static", "imex", "explicit"])
+@pytest.mark.parametrize("stepper", [
+    "implicit_euler", "bdf2", "quasi_static",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("imex", "explicit")),
+])  # fmt: skip
 def test_no_result_depends_on_a_profile(stepper):
     soft = {"name": "penalty", "stiffness_N_mm3": 0.1}  # those with substeps need few for that
     options = {"stepper": stepper, "contact": soft, "duration": 0.02}
@@ -420,7 +423,7 @@ def test_an_evaluation_is_profiled_only_if_asked_for(plain):
     assert not any("profile" in name for name in plain["timings"])
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_profile_comes_from_processes_too_and_changes_no_bit(plain, jobs):
     result = run(profile=True, jobs=jobs)
     assert json.loads(json.dumps(result, allow_nan=False)) == result
