@@ -108,18 +108,21 @@ def _estimate_line(estimate: Mapping[str, Any]) -> str:
 
 
 def print_explanation(name: str, row: Mapping[str, Any]) -> None:
-    """Print the effects of one grasp (`finqd.explain.Explanation.to_dict`), a row each, and what came of it."""
+    """Print the effects of one grasp (`finqd.explain.Explanation.to_dict`), a row each, and what came of it.
+
+    Either why each is on or off, or what its being the other way round changes.
+    """
     console = _console()
     console.print(f"[bold]{escape(name)}[/bold]: {escape(_outcome(row))}", soft_wrap=True)
     if row["reason"]:
         console.print(escape(row["reason"]), soft_wrap=True)
     asked = any("what_if" in line for line in row["effects"].values())
-    more = ("the other way round", "held", "force [%]>", "drop [mm]>", "seconds>") if asked else ()
-    table = _table("effect", "", "since [s]>", *more, "why")
+    more = ("what if", "held", "force [%]>", "drop [mm]>", "seconds>") if asked else ("why",)
+    table = _table("effect", "", "since [s]>", *more)
     for effect, line in row["effects"].items():
         other = line.get("what_if", {})
-        cells = _changes(row, other) if asked else []
-        table.add_row(effect, line["state"], _number(line["since_s"], 2), *cells, escape(line["why"]))
+        cells = _changes(row, other) if asked else [escape(line["why"])]
+        table.add_row(effect, line["state"], _number(line["since_s"], 2), *cells)
     console.print(table)
     for effect, line in row["effects"].items():
         if line.get("what_if", {}).get("reason"):

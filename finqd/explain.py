@@ -107,19 +107,23 @@ def explain(
     solids = [chosen.plugin("geometry").build(chosen.finger_si(i)) for i in range(len(chosen.fingers))]
     meshes = finger_meshes(chosen, solids)
     others = _others(chosen) if what_if else {}
-    changed = [(name, other) for name, other in others.items() if not isinstance(other, str)]
     tasks, labels = [], []
     for thing in grasped:
-        tasks.append(GraspTask(design=chosen, meshes=meshes, grasped=thing))
-        labels.append(thing.name)
-        for name, other in changed:
+        for name, other in (("", chosen), *_changed(others, thing)):
             tasks.append(GraspTask(design=other, meshes=meshes, grasped=thing))
-            labels.append(f"{thing.name}, {name} {other.forced_effects[name]}")
-    found = run_grasps(tasks, labels=labels, jobs=jobs, progress=progress)
-    each = 1 + len(changed)
+            labels.append(f"{thing.name}, {name} {other.forced_effects[name]}" if name else thing.name)
+    found = iter(run_grasps(tasks, labels=labels, jobs=jobs, progress=progress))
     return [
-        _explanation(chosen, thing, others, changed, found[each * i : each * (i + 1)])
-        for i, thing in enumerate(grasped)
+        _explanation(chosen, thing, others, next(found), [next(found) for _ in _changed(others, thing)])
+        for thing in grasped
+    ]
+
+
+def _changed(others: Mapping[str, Design | str], thing: GraspObject) -> list[tuple[str, Design]]:
+    """Return the effects that can be the other way round in a grasp of ``thing``, each with that design."""
+    return [
+        (name, other) for name, other in others.items()
+        if not isinstance(other, str) and (name != "soft_object" or thing.soft is not None)
     ]
 
 
@@ -136,10 +140,9 @@ def _others(design: Design) -> dict[str, Design | str]:
 
 
 def _explanation(
-    design: Design, thing: GraspObject, others: Mapping[str, Design | str], changed: Sequence[tuple[str, Any]],
-    found: Sequence[Trajectory],
+    design: Design, thing: GraspObject, others: Mapping[str, Design | str], base: Trajectory, rest: Sequence[Trajectory]
 ) -> Explanation:
-    base, *rest = found
+    changed = _changed(others, thing)
     outcomes = {name: Outcome.of(other, thing.name, run) for (name, other), run in zip(changed, rest, strict=True)}
     lines = []
     for name, sentence in effects_of(design).items():
