@@ -294,6 +294,7 @@ def test_without_contact_the_object_stays_on_the_floor(task):
     assert run.effects["object_contact"] == {"since_s": None, "why": "never within reach"}
 
 
+@pytest.mark.slow
 def test_without_a_limit_drives_press_harder(task):
     limited = replace(task, design=task.design.with_overrides({"actuation.force_limit_N": 2.0}))
     weak, strong = simulate_grasp(limited), simulate_grasp(forced(limited, actuator_force_limit="off"))
