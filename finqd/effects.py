@@ -30,8 +30,8 @@ STATES = ("on", "off", "auto")
 class Effect:
     """One effect.
 
-    what: it is; needed: when, a bound that is checked; plain: on or off and why, with the plugins that a design has by
-    default; fixed: why it cannot be forced on, if it cannot
+    what: it is; needed: when (of contacts, a bound that is looked at all the time); plain: on or off and why, with the
+    plugins that a design has by default; fixed: why it cannot be forced on, if it cannot
     """
 
     what: str
@@ -65,7 +65,7 @@ EFFECTS: dict[str, Effect] = {
     ),
     "inertia": Effect(
         what="masses of the fingers resist acceleration; the object's own always do",
-        needed="always: it is a diagonal, and what moves on without it may buckle at once",
+        needed="always",
         plain="on: always",
     ),
     "damping": Effect(
@@ -77,7 +77,7 @@ EFFECTS: dict[str, Effect] = {
         what="the fingers' own weight", needed="there is gravity", plain="on: always",
     ),
     "large_rotation": Effect(
-        what="elements turn without stretching", needed="drives turn fingers, or bend them, by more than a degree",
+        what="elements turn without stretching", needed="always in a grasp: drives turn the fingers",
         plain="on: corotated elements",
     ),
     "material_nonlinearity": Effect(
@@ -126,8 +126,11 @@ def effects_schema() -> dict[str, Any]:
             {"type": "array", "items": {"enum": list(EFFECTS)}, "uniqueItems": True,
              "description": "those that are on; all others are off"},
             {"type": "object", "additionalProperties": False,
-             "properties": {name: {"enum": list(STATES), "description": effect.what, "default": "auto"}
-                            for name, effect in EFFECTS.items()}},
+             "properties": {
+                 name: {"enum": list(STATES), "default": "auto",
+                        "description": f"{effect.what}; needed: {effect.needed}"}
+                 for name, effect in EFFECTS.items()
+             }},
         ],
         "default": "auto",
     }
