@@ -13,7 +13,7 @@ from finqd.mechanics.distance import (
     triangle_neighbours,
     triangle_normals,
 )
-from finqd.mechanics.distance_kernels import signed_distance, signed_distances
+from finqd.mechanics.distance_kernels import closest_in_leaf, outside_disc, signed_distance, signed_distances
 from finqd.object_shapes import convex_hull, turned_surface
 
 N = 200 if config.DISABLE_JIT else 10_000
@@ -237,10 +237,35 @@ def test_large_surface_agrees_with_brute_force_over_all_triangles():
     rng = np.random.default_rng(9)
     vertices = vertices + rng.normal(scale=2e-5, size=vertices.shape)
     field = surface_field(vertices, triangles)
-    boxes = np.concatenate([np.zeros((1, 6)), [[-1.0, -1, -1, 1, 1, 1]]])
+    boxes = np.array([12 * [0.0], [-1.0, -1, -1, 1, 1, 1, 0, 0, 0, -np.inf, np.inf, np.inf]])
     brute = field._replace(boxes=boxes, leaf_size=len(field.rows))
     points = cloud(300, seed=10)
     np.testing.assert_array_equal(evaluate(field, points)[0], evaluate(brute, points)[0])
+
+
+@pytest.mark.kernel
+def test_discs_leave_nothing_out_that_is_closest():
+    """With and without them the same bits follow; discs that are too small by a fifth are noticed."""
+    vertices, triangles = turned_surface(DIMPLED, n_around=48 if config.DISABLE_JIT else 300)
+    field, points = surface_field(vertices, triangles), cloud(N // 4, seed=12)
+    without, small = field.boxes.copy(), field.boxes.copy()
+    without[:, 6:9], without[:, 9:] = 0.0, (-np.inf, np.inf, np.inf)
+    small[:, 11] *= 0.8
+    expected = evaluate(field._replace(boxes=without), points)
+    for got, wanted in zip(evaluate(field, points), expected, strict=True):
+        np.testing.assert_array_equal(got, wanted)
+    assert np.any(evaluate(field._replace(boxes=small), points)[0] != expected[0])
+
+
+@pytest.mark.kernel
+def test_the_disc_of_a_node_holds_its_triangles():
+    """Of no point a disc says that it is farther away than the nearest triangle of its leaf is."""
+    field = surface_field(*turned_surface(DIABLO, n_around=24))
+    n_leaves = len(field.boxes) // 2
+    for x, y, z in cloud(20, seed=13):
+        for leaf in range(n_leaves):
+            nearest, _ = closest_in_leaf(field.rows, field.leaf_size, leaf, x, y, z, np.inf, 0)
+            assert not outside_disc(field.boxes, n_leaves + leaf, x, y, z, 1.000001 * nearest)
 
 
 @pytest.mark.kernel

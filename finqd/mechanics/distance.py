@@ -10,6 +10,8 @@ import numpy as np
 from finqd.mechanics.distance_kernels import REVOLUTION, SPHERE, SURFACE, DistanceField
 
 LEAF_SIZE = 4  # triangles a leaf of the tree holds at most; 2 to 8 measure alike
+DISC_TRIANGLES = 512  # nodes of more triangles have no disc: surfaces are too much bent over them
+SPARE = 1e-9  # [m] by which discs are larger than they must be, for rounding
 FLAT = 1e-6  # a triangle lower than this share of its longest side is rounding noise in a single-precision file
 
 
@@ -67,7 +69,7 @@ def surface_field(
         rows=np.concatenate([corners.reshape(-1, 9), normals[order]], axis=1),
         features=features[order],
         pseudonormals=pseudonormals,
-        boxes=_tree_boxes(corners, leaf_size),
+        boxes=_tree_boxes(corners, normals[order], leaf_size),
         leaf_size=leaf_size,
     )
 
@@ -129,7 +131,7 @@ def edge_table(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def _field(**given: Any) -> DistanceField:
     """Fill what is not given with empty arrays, and fix types and memory order: one Numba type for all shapes."""
-    columns = {"rows": 12, "features": 6, "pseudonormals": 3, "boxes": 6}
+    columns = {"rows": 12, "features": 6, "pseudonormals": 3, "boxes": 12}
     arrays = {
         name: np.ascontiguousarray(given.get(name, np.zeros((0, n))), dtype="i4" if name == "features" else "f8")
         for name, n in columns.items()
@@ -200,16 +202,36 @@ def _leaf_order(centres: np.ndarray) -> tuple[np.ndarray, int]:
     return order.reshape(-1), leaf_size
 
 
-def _tree_boxes(corners: np.ndarray, leaf_size: int) -> np.ndarray:
-    """Return the boxes of a complete binary tree over runs of ``leaf_size`` triangles, shape (2 n_leaves, 6)."""
+def _tree_boxes(corners: np.ndarray, normals: np.ndarray, leaf_size: int) -> np.ndarray:
+    """Return the boxes and discs of a complete binary tree over runs of ``leaf_size`` triangles, (2 n_leaves, 12).
+
+    corners: of the triangles [m], (n_slots, 3, 3); normals: theirs, (n_slots, 3)
+    """
     n_leaves = len(corners) // leaf_size
-    boxes = np.zeros((2 * n_leaves, 6))
+    boxes = np.zeros((2 * n_leaves, 12))
     runs = corners.reshape(n_leaves, -1, 3)
-    boxes[n_leaves:, :3], boxes[n_leaves:, 3:] = runs.min(axis=1), runs.max(axis=1)
+    boxes[n_leaves:, :3], boxes[n_leaves:, 3:6] = runs.min(axis=1), runs.max(axis=1)
     first = n_leaves // 2
     while first >= 1:
-        children = boxes[2 * first : 4 * first].reshape(first, 2, 6)
+        children = boxes[2 * first : 4 * first, :6].reshape(first, 2, 6)
         boxes[first : 2 * first, :3] = children[:, :, :3].min(axis=1)
-        boxes[first : 2 * first, 3:] = children[:, :, 3:].max(axis=1)
+        boxes[first : 2 * first, 3:6] = children[:, :, 3:].max(axis=1)
         first //= 2
+    boxes[:, 9:] = -np.inf, np.inf, np.inf  # a disc that leaves nothing out
+    first, size = n_leaves, leaf_size
+    while first >= 1 and size <= DISC_TRIANGLES:
+        _add_discs(boxes[first : 2 * first], corners, normals)
+        first, size = first // 2, 2 * size
     return boxes
+
+
+def _add_discs(boxes: np.ndarray, corners: np.ndarray, normals: np.ndarray) -> None:
+    """Write the discs of all nodes of one level into their ``boxes`` (n_nodes, 12); see `outside_disc`."""
+    axes = _unit(normals.reshape(len(boxes), -1, 3).sum(axis=1))
+    points = corners.reshape(len(boxes), -1, 3)
+    along = np.einsum("npi,ni->np", points, axes)
+    arms = points - 0.5 * (boxes[:, None, :3] + boxes[:, None, 3:6])
+    beside2 = np.einsum("npi,npi->np", arms, arms) - np.einsum("npi,ni->np", arms, axes) ** 2
+    boxes[:, 6:9] = axes
+    boxes[:, 9], boxes[:, 10] = along.min(axis=1) - SPARE, along.max(axis=1) + SPARE
+    boxes[:, 11] = np.sqrt(np.maximum(beside2.max(axis=1), 0.0)) + SPARE

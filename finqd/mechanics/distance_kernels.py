@@ -14,6 +14,8 @@ from finqd.mechanics.compiled import njit
 
 SPHERE, REVOLUTION, SURFACE = 0, 1, 2
 SAME = 1e-9  # normals that differ by less are one
+ALIKE = 1e-9  # relative difference of squared distances that may be rounding, and
+ALIKE_M2 = 1e-18  # [m^2] the same near the surface
 TOUCHING = 1e-12  # below this distance [m] the direction to the closest point is rounding noise
 
 #: kind: SPHERE, REVOLUTION or SURFACE
@@ -26,8 +28,9 @@ TOUCHING = 1e-12  # below this distance [m] the direction to the closest point i
 #:     unit outward normal
 #: features: shape (n_slots, 6), rows of `pseudonormals` for edges ab, bc, ca and for corners a, b, c
 #: pseudonormals: shape (n, 3), unit, angle-weighted normals of edges and vertices
-#: boxes: shape (2 n_leaves, 6), low and high corner of node i's box [m]; its children are nodes 2 i and 2 i + 1, the
-#:     root is node 1, and leaf j (node n_leaves + j) holds slots j leaf_size to (j + 1) leaf_size
+#: boxes: shape (2 n_leaves, 12), low and high corner of node i's box [m], and the axis of its disc, the ends along it
+#:     and its radius [m] (`outside_disc`); its children are nodes 2 i and 2 i + 1, the root is node 1, and leaf j (node
+#:     n_leaves + j) holds slots j leaf_size to (j + 1) leaf_size
 #:
 #: Few arrays, and kernels that take arrays rather than the tuple: each array of a tuple costs two atomic operations of
 #: reference counting wherever the tuple is passed on, which came to half the time of a query.
@@ -41,6 +44,28 @@ def _box_distance2(boxes, node, x, y, z):
     dy = max(boxes[node, 1] - y, 0.0, y - boxes[node, 4])
     dz = max(boxes[node, 2] - z, 0.0, z - boxes[node, 5])
     return dx * dx + dy * dy + dz * dz
+
+
+@njit(cache=True, error_model="numpy")
+def outside_disc(boxes, node, x, y, z, best):
+    """Tell whether a node's disc is at least as far from a point as ``best``, the square of a distance [m^2].
+
+    The disc is a cylinder about the middle of the node's box, along the mean normal of its triangles: of a fine surface
+    it is as thin as that is bent, while boxes are as deep as it leans. By boxes alone a point at a distance d from
+    triangles of a size h has to look at some d / h of them; with discs, at a few.
+    """
+    n0, n1, n2 = boxes[node, 6], boxes[node, 7], boxes[node, 8]
+    along = n0 * x + n1 * y + n2 * z
+    a = max(boxes[node, 9] - along, 0.0, along - boxes[node, 10])
+    left = best + ALIKE * best + ALIKE_M2 - a * a
+    if left <= 0.0:
+        return True
+    x -= 0.5 * (boxes[node, 0] + boxes[node, 3])
+    y -= 0.5 * (boxes[node, 1] + boxes[node, 4])
+    z -= 0.5 * (boxes[node, 2] + boxes[node, 5])
+    along = n0 * x + n1 * y + n2 * z
+    beside2 = x * x + y * y + z * z - along * along
+    return beside2 > left and np.sqrt(beside2) - boxes[node, 11] >= np.sqrt(left)
 
 
 @njit(cache=True, error_model="numpy")
@@ -93,7 +118,7 @@ def _offset(rows, slot, v, w, x, y, z):
 
 
 @njit(cache=True, error_model="numpy")
-def _closest_in_leaf(rows, leaf_size, leaf, x, y, z, best, best_slot):
+def closest_in_leaf(rows, leaf_size, leaf, x, y, z, best, best_slot):
     """Return (squared distance [m^2], slot) of the closest triangle of a leaf, or the given ones if none is closer."""
     for slot in range(leaf * leaf_size, (leaf + 1) * leaf_size):
         v, w, feature = _closest_parameters(rows, slot, x, y, z)
@@ -118,22 +143,26 @@ def _closest_slot(rows, boxes, leaf_size, x, y, z):
     """Slot of the triangle closest to a point: nearest child first, without a stack.
 
     The tree is complete, so a node's number tells its parent and its sibling; bit k of ``trail`` says whether the
-    sibling of the ancestor k levels up is still to be visited.
+    sibling of the ancestor k levels up is still to be visited. Boxes alone say in which order: discs only leave out.
     """
     n_leaves = boxes.shape[0] // 2
     best, best_slot = np.inf, 0
     node, trail = 1, 0
     while True:
         if node >= n_leaves:
-            best, best_slot = _closest_in_leaf(rows, leaf_size, node - n_leaves, x, y, z, best, best_slot)
+            best, best_slot = closest_in_leaf(rows, leaf_size, node - n_leaves, x, y, z, best, best_slot)
         else:
             near, far = 2 * node, 2 * node + 1
             near2, far2 = _box_distance2(boxes, near, x, y, z), _box_distance2(boxes, far, x, y, z)
             if far2 < near2:
-                near, near2, far2 = far, far2, near2
-            if near2 < best:
+                near, far, near2, far2 = far, near, far2, near2
+            if near2 < best and not outside_disc(boxes, near, x, y, z, best):
                 node = near
                 trail = (trail << 1) | (1 if far2 < best else 0)
+                continue
+            if far2 < best and not outside_disc(boxes, far, x, y, z, best):
+                node = far
+                trail <<= 1
                 continue
         while True:
             if trail == 0:
@@ -143,7 +172,7 @@ def _closest_slot(rows, boxes, leaf_size, x, y, z):
                 node >>= 1
             trail ^= 1
             node ^= 1
-            if _box_distance2(boxes, node, x, y, z) < best:
+            if _box_distance2(boxes, node, x, y, z) < best and not outside_disc(boxes, node, x, y, z, best):
                 break
 
 
