@@ -69,7 +69,8 @@ STEPPERS = [
     *({"name": "implicit_euler", "backend": name} for name in available_backends()),
     {"name": "implicit_euler", "linear_solver": "direct"}, {"name": "implicit_euler", "quasi_newton": False},
     {"name": "implicit_euler", "preconditioner": "jacobi"}, {"name": "implicit_euler", "error_tolerance_mm": 0.05},
-    {"name": "bdf2"}, {"name": "bdf2", "error_tolerance_mm": 0.02}, {"name": "quasi_static"},
+    {"name": "bdf2"}, {"name": "quasi_static"},
+    pytest.param({"name": "bdf2", "error_tolerance_mm": 0.02}, marks=pytest.mark.slow),
 ]
 
 

@@ -183,6 +183,7 @@ def untimed(result: dict) -> str:
     return json.dumps({**result, "objects": rows, "timings": None, "estimate": None}, allow_nan=False)
 
 
+@pytest.mark.slow  # minutes; stand-ins say the same of all but the simulation
 def test_a_real_estimate_leaves_the_result_alone_and_says_what_it_cost(plain):
     told: list[str] = []
     found = evaluate(

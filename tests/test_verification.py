@@ -214,6 +214,7 @@ def test_cook_s_membrane_rejects_a_modulus_three_percent_too_small(monkeypatch: 
     assert rejected(case)
 
 
+@pytest.mark.slow
 def test_the_roll_up_rejects_forces_that_are_three_percent_too_large() -> None:
     assert verdict("roll-up", lambda: statics.roll_up((30, 1, 1), "hex8", Wrong(), ramp=30))
     assert not verdict("roll-up", lambda: statics.roll_up((30, 1, 1), "hex8", Wrong(gradient=1.03), ramp=30))
@@ -237,6 +238,7 @@ def test_rolling_rejects_five_percent_more_inertia(monkeypatch: pytest.MonkeyPat
     assert rejected(case_of("rolling", ""))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("forgetful")
 def test_the_pads_reject_three_percent_more_friction(monkeypatch: pytest.MonkeyPatch) -> None:
     right = Scene.friction_between

@@ -38,6 +38,7 @@ def test_ribs_pressed_into_each_other(step, contact):
     assert not touch_themselves(course, 0) and touch_themselves(course, -1), "the ribs come to touch"
 
 
+@pytest.mark.slow  # three minutes; ribs pressed into each other are the fast twin
 @pytest.mark.parametrize("contact", CONTACTS)
 @pytest.mark.parametrize("step", STEPS_MS)
 def test_a_finger_folded_back_on_itself(step, contact):

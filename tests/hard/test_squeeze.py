@@ -33,6 +33,7 @@ def test_shut_on_something(what, step, contact):
     assert found.contact_forces.max() > 0.1
 
 
+@pytest.mark.slow  # three minutes; an apex between the tips is the fast twin
 @pytest.mark.parametrize(("what", "step", "contact"), cases([None]))
 def test_shut_on_nothing(what, step, contact):
     found, course = shut(what, time_step_ms=step, contact=contact)
