@@ -269,15 +269,15 @@ def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out
             a, b = min(ids[i], ids[j]), max(ids[i], ids[j])
             if not mixed and _share_vertex(faces[a], faces[b]):
                 continue
-            least = reach + (relative_way(direction, faces[a], faces[b]) if moving else 0.0)
-            gap = faces_gap(positions, faces[a], faces[b], least)
-            if gap >= least:
-                continue
-            if apart.shape[0] > 0:
+            if apart.shape[0] > 0:  # a search is quicker than axes
                 key = a * faces.shape[0] + b
                 at = np.searchsorted(apart, key)
                 if at < apart.shape[0] and apart[at] == key:
                     continue
+            least = reach + (relative_way(direction, faces[a], faces[b]) if moving else 0.0)
+            gap = faces_gap(positions, faces[a], faces[b], least)
+            if gap >= least:
+                continue
             if count < out.shape[0]:
                 out[count, 0], out[count, 1], out_gap[count] = a, b, gap
             count += 1
