@@ -111,6 +111,17 @@ def new_archive(n_parameters: int, ranges: Ranges, *, cells: int, seed: np.rando
     )
 
 
+def rebuilt(records: Sequence[Record], n_parameters: int, ranges: Ranges, *, cells: int) -> GridArchive:
+    """Return the archive that these records make, in their order: of each cell the first of the best."""
+    archive = new_archive(n_parameters, ranges, cells=cells, seed=np.random.SeedSequence(0))
+    for record in records:
+        if record["status"] == "ok":
+            archive.add_single(
+                record["unit"], record["objective"], _measures(record, ranges), evaluation=record["index"]
+            )
+    return archive
+
+
 def tell(scheduler: Any, batch: Sequence[Record], ranges: Ranges) -> None:
     """Tell a scheduler what became of the designs it asked for, in its order: finite numbers, whatever happened."""
     scheduler.tell(
