@@ -304,6 +304,10 @@ class RunLog:
         with _in_words(self._path):
             return list(_told_records(self._connection, first, end, self.run.settings, self.run.parameters))
 
+    def elite_records(self, indices: Sequence[int]) -> list[Record]:
+        """Return the final records with these indices."""
+        return [record for index in sorted(indices) for record in self.told_records(index, index + 1)]
+
     def found(
         self, digest: str, preset: str, objects: Any, *, versions: Mapping[str, str] | None = None
     ) -> Record | None:
