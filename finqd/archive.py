@@ -111,6 +111,17 @@ def new_archive(n_parameters: int, ranges: Ranges, *, cells: int, seed: np.rando
     )
 
 
+def rebuilt(records: Sequence[Record], n_parameters: int, ranges: Ranges, *, cells: int) -> GridArchive:
+    """Return the archive that these records make, in their order: of each cell the first of the best."""
+    archive = new_archive(n_parameters, ranges, cells=cells, seed=np.random.SeedSequence(0))
+    for record in records:
+        if record["status"] == "ok":
+            archive.add_single(
+                record["unit"], record["objective"], _measures(record, ranges), evaluation=record["index"]
+            )
+    return archive
+
+
 def tell(scheduler: Any, batch: Sequence[Record], ranges: Ranges) -> None:
     """Tell a scheduler what became of the designs it asked for, in its order: finite numbers, whatever happened."""
     scheduler.tell(
@@ -174,13 +185,23 @@ def elites(archive: GridArchive, records: Sequence[Record]) -> list[tuple[tuple[
     return [(tuple(map(int, cell)), by_index[int(e)]) for cell, e in zip(cells, data["evaluation"][order])]
 
 
+def elite_indices(archive: GridArchive) -> list[int]:
+    """Return the indices of the records that are elites."""
+    return [] if archive.empty else [int(index) for index in archive.data("evaluation")]
+
+
+def would_enter(archive: GridArchive, record: Record, ranges: Ranges) -> bool:
+    """Return whether a record that counts would enter the archive."""
+    occupied, elite = archive.retrieve_single(_measures(record, ranges))
+    return record["objective"] > (elite["objective"] if occupied else THRESHOLD_MIN)
+
+
 def archive_table(
-    archive: GridArchive, records: Sequence[Record], ranges: Ranges, parameters: Sequence[tuple[str, Parameter]]
+    found: Sequence[tuple[tuple[int, ...], Record]], ranges: Ranges, parameters: Sequence[tuple[str, Parameter]]
 ) -> str:
-    """Return the archive as CSV, a row an elite: cell, scores, parameters in JSON units, unit vector."""
+    """Return elites as CSV, a row each: cell, scores, parameters in JSON units, unit vector."""
     paths = [path for path, _ in parameters]
     axes = [f"cell_{name}" for name in ranges]
-    found = elites(archive, records)
     objects = sorted({name for _, record in found for name in record["objects"]})
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -1,36 +1,41 @@
 """Search the design space for a map of different good grippers: ask, evaluate, tell.
 
-CMA-ME (Fontaine et al. 2020, arXiv:1912.02400) through ``ribs``: a grid archive over the features and one emitter that
-ranks by improvement, over the unit cube of whatever parameters the geometry declares. The same seed gives the same
-archive with any number of jobs, as long as no evaluation runs into its time limit.
+The algorithms (`finqd.algorithms`) run over the unit cube of whatever parameters the geometry declares. The run's log
+is the truth (`finqd.runlog`): each evaluation is in it before the algorithm is told, and on an existing log the
+algorithm is asked and told again, from the log, up to where it stood. So the same seed gives the same archive with any
+number of jobs, in one go or killed and resumed, as long as no evaluation runs into its time limit.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from finqd import archive as qd
-from finqd.contracts import Parameter
-from finqd.data import bundled_names, objects_folder
+from finqd.algorithms import ALGORITHMS, new_scheduler, reflected
 from finqd.design import Design, design_parameters
-from finqd.errors import InputError, MissingLibraryError
-from finqd.runlog import RunLog, new_run_folder
-from finqd.search_files import record_of, settings_of, write_archive, write_json
-from finqd.search_plots import draw
-from finqd.workers import TaskFailure, run_tasks
+from finqd.errors import InputError
+from finqd.runlog import Record, Run, RunLog, begun, read_run
+from finqd.search_evaluate import Evaluations, evaluated, run_twice
+from finqd.search_files import write_derived
+from finqd.search_progress import Reporter, Standing
+from finqd.search_settings import check_options, check_ranges, refuse_changes, settings_of
+from finqd.workers import run_tasks
 
 if TYPE_CHECKING:
     from ribs.archives import GridArchive
     from ribs.schedulers import Scheduler
 
-SIGMA0 = 0.2  # of the unit cube's edge: larger steps mostly leave it
+__all__ = ["ALGORITHMS", "Evaluator", "SearchResult", "Standing", "optimise", "reflected"]
+
+SAME = 1e-6  # of the cube's edge: another machine's rounding; more is another algorithm
 
 Progress = Callable[[str, float], None]
 
@@ -39,7 +44,7 @@ class Evaluator(Protocol):
     """What a search calls on a design: `finqd.evaluate.evaluate`, or anything that can be pickled and looks like it.
 
     The result has ``fitness`` in [0, 1], ``margin`` in [-1, 1], ``features``, and ``to_dict()``, in which ``objects``
-    holds a row for each object.
+    holds a row for each object. Its name is a setting of the run; what it does must follow from the design alone.
     """
 
     def __call__(self, design: Design, *, objects: Any, preset: str, jobs: int, progress: Progress) -> Any: ...  # noqa: D102
@@ -47,12 +52,22 @@ class Evaluator(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchResult:
-    """The archive of a search, the records that it was told (those of the log, in order), and the map's axes."""
+    """The archive of a search, its run as `finqd.runlog.read_run` reads it, and where the search stood at its end."""
 
     archive: GridArchive
-    records: tuple[qd.Record, ...]
-    ranges: qd.Ranges
+    run: Run
+    standing: Standing
     out: Path
+
+    @property
+    def ranges(self) -> qd.Ranges:
+        """The map's axes: feature -> range."""
+        return self.run.ranges
+
+    @cached_property
+    def records(self) -> tuple[Record, ...]:
+        """What the search was told, in order."""
+        return self.run.records()
 
     @property
     def elites(self) -> list[tuple[tuple[int, ...], qd.Record]]:
@@ -61,154 +76,210 @@ class SearchResult:
 
 
 def optimise(
-    *,
-    out: Path,
-    iterations: int = 5,
-    batch: int = 15,
-    objects: Sequence[Any] | None = None,
-    jobs: int = 1,
-    seed: int = 0,
-    preset: str = "standard",
-    base_design: Design | None = None,
-    evaluate: Evaluator | None = None,
-    cells: int = 10,
-    ranges: qd.Ranges | None = None,
-    time_limit_s: float = 3600.0,
-    progress: Progress | None = None,
+    *, out: Path, algorithm: str = "cma_me", iterations: int = 5, batch: int = 15,
+    objects: Sequence[Any] | None = None, jobs: int = 1, seed: int = 0, preset: str = "standard",
+    screen: str | None = None, base_design: Design | None = None, evaluate: Evaluator | None = None, cells: int = 10,
+    ranges: qd.Ranges | None = None, time_limit_s: float | None = 3600.0, workers: Any = None,
+    other_versions: bool = False, progress: Progress | None = None, report: Callable[[Standing], None] | None = None,
 ) -> SearchResult:
-    """Run ``iterations`` rounds of ``batch`` designs each; return the archive. `finqd.search_files` lists the files.
+    """Run ``iterations`` rounds of ``batch`` designs each, or what is left of them; return the archive.
 
+    out: the run's folder; one that holds a run goes on with it. `finqd.search_files` lists what else is in it
+    algorithm: one of `ALGORITHMS`
     objects: as for `finqd.evaluate.evaluate`; None means all that come with finqd
     jobs: designs evaluated side by side, each in a worker process
+    preset: of all evaluations; screen: a cheaper one, with which every design is evaluated first: then only those that
+        would enter the map are evaluated with ``preset``, and only these results can become elites
     base_design: where geometry, material, plugins and protocol come from; its fingers and spacing do not matter
     cells: cells of the map along each feature
     ranges: features to map and their ranges, in their units; by default the first feature of each feature plugin of
         the design, with the range that `finqd.archive.feature_ranges` finds
-    time_limit_s: wall-clock seconds of one evaluation; a design that takes longer has failed
-    progress: called as ``progress("iteration 1 of 5", fraction)``
+    time_limit_s: wall-clock seconds of one evaluation, None: as long as it takes; who takes longer has failed
+    workers: where evaluations run, with ``run(function, tasks, time_limit_s=, on_result=, on_progress=)``; by default
+        ``jobs`` processes (in this one with one job and no time limit)
+    other_versions: go on with a run that was begun with other versions of finqd or its libraries
+    progress: called as ``progress("iteration 1 of 5", fraction)``; report: called with a `Standing` after each design
 
-    A design that fails (no simulation finished, its process crashed, time limit) is a line of the log with its reason
-    and never an elite. Raises ``InputError`` for bad options and for a folder that is not empty. Ctrl-C ends the
-    workers, leaves the log with all that finished and the archive with all that was told, and is raised again.
+    A design that fails (no simulation finished, its process crashed twice, time limit) is in the log with its reason
+    and never an elite. Raises ``InputError`` for bad options, a folder that is neither empty nor a run, a run that
+    began with other settings (``iterations`` may grow) or that another process writes to, and a full disk. Ctrl-C ends
+    the workers, leaves the log with all that finished, and is raised again.
     """
-    _check(objects=objects, preset=preset, ranges=ranges, iterations=iterations, batch=batch, seed=seed, cells=cells)
-    call = partial(_evaluated, evaluate=evaluate or _default_evaluator(), objects=objects, preset=preset)
-    evaluate_all = partial(run_tasks, call, jobs=jobs, time_limit_s=time_limit_s)
-    evaluate_all([])  # refuses its options before a file is written
-    run = _Run.start(base_design, batch=batch, seed=seed, cells=cells, ranges=ranges)
-    settings = settings_of(
-        run.base, run.parameters, run.ranges, iterations=iterations, batch=batch, seed=seed, sigma0=SIGMA0, cells=cells,
-        objects=objects, preset=preset, jobs=jobs, time_limit_s=time_limit_s,
+    presets = {"preset": preset, "screen": screen}
+    check_options(
+        algorithm=algorithm, objects=objects, presets=presets, ranges=ranges, iterations=iterations, batch=batch,
+        seed=seed, cells=cells,
     )  # fmt: skip
-    out, status = new_run_folder(Path(out)), "interrupted"
-    write_json(out / "run.json", {"status": "running", **settings})
-    try:
-        with RunLog(out / "evaluations.jsonl") as log:
+    call = partial(evaluated, evaluate=evaluate or _default_evaluator(), objects=objects)
+    if workers is None:
+        run_all = partial(run_twice, partial(run_tasks, jobs=jobs, time_limit_s=time_limit_s))
+    else:
+        run_all = partial(workers.run, time_limit_s=time_limit_s)
+    run_tasks(call, [], jobs=jobs, time_limit_s=time_limit_s)  # refuses its options before a file is written
+    base = {} if base_design is None else {k: v for k, v in base_design.settings.items() if k != "name"}
+    settings = partial(
+        settings_of, base=base, objects=objects, algorithm=algorithm, seed=seed, iterations=iterations, batch=batch,
+        cells=cells, limits={"time_limit_s": time_limit_s}, evaluate=call.keywords["evaluate"], **presets,
+    )  # fmt: skip
+    with _log(Path(out), base, ranges, settings, other_versions=other_versions) as log:
+        search = _Search.start(log, run_all=run_all, call=call, report=report)
+        try:
             for iteration in range(iterations):
-                shown = partial(progress, f"iteration {iteration + 1} of {iterations}") if progress else None
-                run.step(iteration, evaluate_all, log, shown)
-                write_archive(out, run.archive, run.records, run.ranges, run.parameters, run.decoded)
-        status = "finished"
-    finally:
-        write_archive(out, run.archive, run.records, run.ranges, run.parameters, run.decoded)
-        draw(out, run.archive, run.records, run.ranges)
-        write_json(out / "run.json", {"status": status, "evaluations_told": len(run.records), **settings})
-    return SearchResult(archive=run.archive, records=tuple(run.records), ranges=run.ranges, out=out)
+                name = f"iteration {iteration + 1} of {iterations}"
+                search.step(iteration, partial(progress, name) if progress else None)
+                search.refresh()
+        finally:
+            search.refresh(always=True)
+        return SearchResult(archive=search.archive, run=read_run(Path(out)), standing=search.reporter.standing, out=out)
+
+
+@contextmanager
+def _log(
+    out: Path, base: Mapping[str, Any], ranges: qd.Ranges | None, settings: Callable[..., dict[str, Any]], *,
+    other_versions: bool,
+) -> Iterator[RunLog]:
+    """Open the log of a run that goes on, if that is the same run, or begin a new one."""
+    parameters = design_parameters(base.get("geometry", "fin_ray"))
+    if ranges is not None:
+        check_ranges(ranges, base, len(parameters))
+    if begun(out):
+        with RunLog(out) as log:
+            old = log.run.settings
+            sampled = ranges is None and old.get("sampled")
+            new = settings(ranges=log.run.ranges if sampled else ranges or {}, sampled=ranges is None)
+            refuse_changes(old, new, other_versions=other_versions, where=str(out))
+            if new != old:
+                log.change_settings(new)
+            yield log
+        return
+    found = ranges or qd.feature_ranges(partial(Design.from_unit_vector, **base), len(parameters))
+    new = settings(ranges=found, sampled=ranges is None)
+    with RunLog.start(out, settings=new, base=base, parameters=parameters, ranges=found) as log:
+        yield log
 
 
 @dataclass
-class _Run:
-    """A search under way."""
+class _Search:
+    """A search under way: a pure function of seed and log, and what is evaluated where the log ends."""
 
-    base: Mapping[str, Any]  # what all designs share: geometry, material, plugins, protocol
-    parameters: Sequence[tuple[str, Parameter]]
-    ranges: qd.Ranges
+    log: RunLog
+    evaluations: Evaluations
+    reporter: Reporter
     archive: GridArchive
     scheduler: Scheduler
-    batch: int
-    seed: int
+    told: int  # of an earlier session
     redraws: int = 0
-    records: list[qd.Record] = field(default_factory=list)  # what was told, in order
+    written: dict[tuple[int, ...], int] = field(default_factory=dict)  # what lies in the folder: cell -> evaluation
 
     @classmethod
-    def start(cls, base_design: Design | None, *, batch: int, seed: int, cells: int, ranges: qd.Ranges | None) -> _Run:
-        base = {} if base_design is None else {k: v for k, v in base_design.settings.items() if k != "name"}
-        parameters = design_parameters(base.get("geometry", "fin_ray"))
-        found = ranges or qd.feature_ranges(partial(Design.from_unit_vector, **base), len(parameters))
-        archive = qd.new_archive(len(parameters), found, cells=cells, seed=_stream(seed, 0))
-        return cls(base, parameters, found, archive, _new_scheduler(archive, batch, _stream(seed, 1)), batch, seed)
-
-    def step(
-        self, iteration: int, evaluate_all: Callable[..., Any], log: RunLog, shown: Callable[[float], None] | None
-    ) -> None:
-        """Ask for a batch, evaluate it, log each result as it comes, tell all of them."""
-        units = self.scheduler.ask()
-        first = iteration * self.batch
-        designs = [self.decoded(unit, first + i) for i, unit in enumerate(units)]
-        valid = [i for i, design in enumerate(designs) if isinstance(design, Design)]
-        records: dict[int, qd.Record] = {}
-        refused: list[BaseException] = []
-        fractions = np.zeros(len(units))
-
-        def move(i: int, fraction: float) -> None:
-            fractions[i] = fraction
-            if shown is not None:
-                shown(float(fractions.mean()))
-
-        def keep(i: int, result: Any) -> None:
-            record = record_of(units[i], designs[i], result, self.parameters, tuple(self.ranges))
-            place = {"index": first + i, "iteration": iteration, "emitter": 0, "seed": self.seed}
-            records[i] = {**place, **record}
-            log.append(records[i])
-            if isinstance(result, TaskFailure) and isinstance(result.exception, (InputError, MissingLibraryError)):
-                refused.append(result.exception)
-            move(i, 1.0)
-
-        for i in sorted(set(range(len(units))) - set(valid)):
-            keep(i, designs[i])
-        evaluate_all(
-            [designs[i] for i in valid],
-            on_result=lambda k, result: keep(valid[k], result),
-            on_progress=lambda k, fraction: move(valid[k], fraction),
+    def start(
+        cls, log: RunLog, *, run_all: Callable[..., Any], call: Callable[..., Any],
+        report: Callable[[Standing], None] | None,
+    ) -> _Search:
+        run, settings = log.run, log.run.settings
+        total = settings["iterations"] * settings["batch"]
+        standing = Standing(
+            iteration=0, iterations=settings["iterations"], evaluations=0, total=total, seconds=log.seconds
         )
-        if len(valid) == len(refused) > 0 and self.archive.empty:
-            raise refused[0]  # not one design could be tried: it is what the user gave that is wrong
-        self.tell([records[i] for i in range(len(units))])
+        reporter = Reporter(run.folder, standing=standing, report=report)
+        evaluations = Evaluations(
+            log=log, run_all=run_all, call=call, base=run.base, parameters=run.parameters, features=tuple(run.ranges),
+            seed=settings["seed"], versions=settings["versions"], clock=lambda: reporter.seconds,
+        )  # fmt: skip
+        archive = qd.new_archive(
+            len(run.parameters), run.ranges, cells=settings["cells"], seed=_stream(settings["seed"], 0)
+        )
+        scheduler = new_scheduler(settings["algorithm"], archive, settings["batch"], _stream(settings["seed"], 1))
+        return cls(log, evaluations, reporter, archive, scheduler, log.told)
 
-    def tell(self, batch: list[qd.Record]) -> None:
-        if self.archive.empty and all(record["status"] != "ok" for record in batch):
+    def step(self, iteration: int, shown: Callable[[float], None] | None) -> None:
+        """Ask for a batch, evaluate what the log does not hold, note that it is told, and tell it."""
+        batch = self.log.run.settings["batch"]
+        first = iteration * batch
+        self.reporter.begin_iteration(iteration)
+        asked = self.scheduler.ask()
+        known = self.log.evaluations(first, first + batch)
+        units = self._agreed(asked, first, known)
+        records = self._evaluated(units, iteration, known, shown)
+        old = first + batch <= self.told
+        if not old:
+            self.log.note_told(first + batch)
+        self.tell([records[index] for index in units])
+        self.reporter.end_iteration(iteration, self.archive, quiet=old)
+
+    def _evaluated(
+        self, units: Mapping[int, np.ndarray], iteration: int, known: Mapping[tuple[int, str], Record],
+        shown: Callable[[float], None] | None,
+    ) -> dict[int, Record]:
+        """Return the final record of each design: the confirmed one, if it was screened and would enter the map."""
+        settings, fractions = self.log.run.settings, dict.fromkeys(units, 0.0)
+        screen, final = settings["screen"], settings["confirm"] or settings["preset"]
+
+        def move(index: int, fraction: float) -> None:
+            fractions[index] = fraction
+            if shown is not None:
+                shown(sum(fractions.values()) / len(fractions))
+
+        def finish(record: Record) -> None:
+            (self.reporter.recall if (record["index"], record["preset"]) in known else self.reporter.count)(record)
+            move(record["index"], 1.0)
+
+        def noted(record: Record) -> None:
+            if record["preset"] == final or not self._enters(record):
+                finish(record)
+
+        stage = partial(
+            self.evaluations.stage, iteration=iteration, known=known, on_record=noted, empty=self.archive.empty
+        )
+        if screen is None:
+            records = stage(units, preset=final, on_progress=move)
+        else:
+            screened = stage(units, preset=screen, on_progress=lambda i, fraction: move(i, 0.5 * fraction))
+            chosen = {i: unit for i, unit in units.items() if self._enters(screened[i])}
+            confirmed = stage(chosen, preset=final, on_progress=lambda i, fraction: move(i, 0.5 + 0.5 * fraction))
+            records = {i: {**confirmed[i], "screen": screened[i]} if i in chosen else screened[i] for i in units}
+        for index, record in records.items():
+            if (index, record["preset"]) in known:
+                finish(record)
+        return records
+
+    def _enters(self, record: Record) -> bool:
+        """Return whether a design would enter the map as it was before this batch, if its screening were true."""
+        return record["status"] == "ok" and qd.would_enter(self.archive, record, self.log.run.ranges)
+
+    def _agreed(
+        self, asked: np.ndarray, first: int, known: Mapping[tuple[int, str], Record]
+    ) -> dict[int, np.ndarray]:
+        """Return index -> point of the cube, of the log where it has one, which must be the one asked for.
+
+        Another machine may round otherwise, and an evolution strategy then asks for the same points but for that.
+        """
+        logged = {index: np.array(record["unit"]) for (index, _), record in known.items()}
+        for i, unit in enumerate(asked):
+            if first + i in logged and not np.allclose(unit, logged[first + i], rtol=0.0, atol=SAME):
+                text = f"cannot go on: its algorithm asks for another design as evaluation {first + i} than it did"
+                raise InputError(f"{text} when that was evaluated, so ribs or NumPy differ", str(self.log.run.folder))
+        units = np.array([logged.get(first + i, unit) for i, unit in enumerate(asked)])
+        self.scheduler._cur_solutions = units  # what is told is what was evaluated; there is no public way to say so
+        return {first + i: unit for i, unit in enumerate(units)}
+
+    def tell(self, batch: list[Record]) -> None:
+        """Tell the algorithm what became of what it asked for."""
+        settings = self.log.run.settings
+        nothing = self.archive.empty and all(record["status"] != "ok" for record in batch)
+        if nothing and ALGORITHMS[settings["algorithm"]].restarts:
             # Nothing to learn from, and ribs would restart from an elite, of which there is none: draw anew instead.
             self.redraws += 1
-            self.scheduler = _new_scheduler(self.archive, self.batch, _stream(self.seed, 1 + self.redraws))
-        else:
-            qd.tell(self.scheduler, batch, self.ranges)
-        self.records.extend(batch)
+            seed = _stream(settings["seed"], 1 + self.redraws)
+            self.scheduler = new_scheduler(settings["algorithm"], self.archive, settings["batch"], seed)
+            return
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".* was empty before adding solutions")
+            qd.tell(self.scheduler, batch, self.log.run.ranges)
 
-    def decoded(self, unit: np.ndarray, index: int) -> Design | TaskFailure:
-        """Return the design at a point of the unit cube, or why there is none there."""
-        try:
-            return Design.from_unit_vector(unit, **self.base, name=f"seed {self.seed}, evaluation {index}")
-        except InputError as error:  # values that contradict each other, each within its range
-            return TaskFailure(kind="invalid", reason=str(error))
-
-
-def _evaluated(
-    design: Design, *, evaluate: Evaluator, objects: Any, preset: str, progress: Callable[[float], None]
-) -> dict[str, Any]:
-    """Evaluate one design, in a worker; return the parts of the result that the search needs."""
-    begin = time.perf_counter()
-    fractions: dict[str, float] = {}
-    expected = len(objects) if objects is not None else len(bundled_names(objects_folder()))
-
-    def move(name: str, fraction: float) -> None:
-        fractions[name] = fraction
-        progress(sum(fractions.values()) / max(expected, len(fractions)))
-
-    found = evaluate(design, objects=objects, preset=preset, jobs=1, progress=move)
-    record = {"fitness": found.fitness, "margin": found.margin, "features": dict(found.features)}
-    result = found.to_dict()
-    record |= {"accuracy": result.get("accuracy", {}).get("sentence"), "objects": result.get("objects", {})}
-    return {**record, "seconds": time.perf_counter() - begin}
+    def refresh(self, *, always: bool = False) -> None:
+        """Write the files that are derived from the log, at the end and now and then before."""
+        write_derived(self.log, self.archive, self.written, always=always)
 
 
 def _default_evaluator() -> Evaluator:
@@ -217,53 +288,5 @@ def _default_evaluator() -> Evaluator:
     return evaluate
 
 
-def _new_scheduler(archive: GridArchive, batch: int, seed: Any) -> Scheduler:
-    from ribs.emitters import EvolutionStrategyEmitter
-    from ribs.schedulers import Scheduler
-
-    class Reflecting(EvolutionStrategyEmitter):
-        """Folds what lies outside the unit cube back; ribs' own bounds draw again, near a corner without end."""
-
-        def ask(self) -> np.ndarray:
-            return reflected(super().ask())
-
-    with np.errstate(invalid="ignore"):  # ribs divides 0 by 0 for a batch of one, and never uses the result
-        emitter = Reflecting(
-            archive, x0=np.full(archive.solution_dim, 0.5), sigma0=SIGMA0, ranker="2imp", batch_size=batch, seed=seed
-        )
-    # Added one by one: for a batch, a finite threshold_min makes a cell's threshold the mean of all that fell into it,
-    # and then a later, worse design replaces its elite.
-    return Scheduler(archive, [emitter], add_mode="single")
-
-
-def reflected(points: np.ndarray) -> np.ndarray:
-    """Return points folded into the unit cube at its faces, as often as it takes.
-
-    >>> reflected(np.array([0.3, -0.2, 1.25, 2.5])).round(12).tolist()
-    [0.3, 0.2, 0.75, 0.5]
-    """
-    folded = np.mod(points, 2.0)
-    return np.where(folded > 1.0, 2.0 - folded, folded)
-
-
 def _stream(seed: int, number: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=(number,))
-
-
-def _check(*, objects: Any, preset: str, ranges: qd.Ranges | None, **numbers: Any) -> None:
-    """Refuse options that cannot work, before anything is built or written."""
-    from finqd.presets import PRESETS
-
-    for name, value in numbers.items():
-        least = 0 if name == "seed" else 1
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise InputError(f"must be a whole number from {least} upwards, got {value!r}", where=name)
-    if preset not in PRESETS:
-        raise InputError(f"there is no preset {preset!r}; known: {', '.join(PRESETS)}", where="preset")
-    for name, (low, high) in (ranges or {}).items():
-        if not (np.isfinite(low) and np.isfinite(high) and low < high):
-            raise InputError(f"must be a low and a higher number, got {low!r} and {high!r}", where=f"ranges.{name}")
-    if objects is not None:
-        from finqd.evaluate import load_objects
-
-        load_objects(objects)

@@ -1,105 +1,68 @@
-"""What a search writes, as it goes along.
+"""What a search leaves in its folder beside the log, all of it made from the log, and made again as it goes on.
 
-    OUT/run.json           settings, search space, ranges, versions, and how the run ended
-    OUT/evaluations.jsonl  every evaluation, a line each, in the order in which they finished
-    OUT/archive.csv        the elites after the last whole iteration
-    OUT/elites/*.json      their design files, named after their cells
-    OUT/*.png              heatmap, coverage, QD score (`finqd.search_plots`)
+    RUN/run.sqlite     the log, which is the truth (`finqd.runlog`); RUN/run.lock: who writes to it
+    RUN/progress.log   how far it was, line by line (`finqd.search_progress`)
+    RUN/archive.csv    the elites
+    RUN/elites/*.json  their design files, named after their cells
+    RUN/*.png          heatmap, coverage, QD score (`finqd.search_plots`), when a session ends
 """
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
-from importlib.metadata import version
+import time
+import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from finqd import archive as qd
-from finqd.contracts import Parameter
 from finqd.design import Design
-from finqd.runlog import plain, write_whole
-from finqd.workers import TaskFailure
+from finqd.runlog import RunLog, write_whole
+from finqd.search_evaluate import decoded
 
 if TYPE_CHECKING:
     from ribs.archives import GridArchive
 
-Parameters = Sequence[tuple[str, Parameter]]
+WRITE_EVERY_S = 60.0
+
+_last: dict[Path, float] = {}
 
 
-def record_of(
-    unit: np.ndarray, design: Design | TaskFailure, result: Any, parameters: Parameters, features: Sequence[str]
-) -> dict[str, Any]:
-    """Return what the log says of one evaluation.
-
-    ``result``: what the search's worker returned, or the `TaskFailure` in its place. ``status`` is "ok", "failed" (was
-    evaluated, but see `finqd.archive.why_failed`), "invalid" (no design), "error", "crash" or "timeout".
-    """
-    record: dict[str, Any] = {"unit": unit.tolist(), "parameters": {}, "design_digest": None}
-    if isinstance(design, Design):
-        record["parameters"] = {path: value for (path, _), value in zip(parameters, design.to_vector().tolist())}
-        record["design_digest"] = design.digest()
-    record |= {"fitness": None, "margin": None, "objective": qd.PENALTY, "features": {}, "objects": {}, "seconds": None}
-    if isinstance(result, TaskFailure):
-        record |= {"status": result.kind, "reason": result.reason, "details": result.details}
-    else:
-        reason = qd.why_failed(result, features)
-        record |= {**plain(result), "status": "failed" if reason else "ok", "reason": reason}
-        if not reason:
-            record["objective"] = qd.objective(record["fitness"], record["margin"], max(1, len(record["objects"])))
-    return {**record, "versions": versions()}
-
-
-def settings_of(
-    base: Mapping[str, Any], parameters: Parameters, ranges: qd.Ranges, *, objects: Sequence[Any] | None, **options: Any
-) -> dict[str, Any]:
-    """Return what ``run.json`` says of a run, enough to repeat it."""
-    return {
-        "algorithm": "CMA-ME: GridArchive, one EvolutionStrategyEmitter (2imp), reflected at the unit cube, from 0.5",
-        "objective": f"fitness + {qd.TIE_BREAK} / objects * (1 + margin) / 2",
-        "penalty": qd.PENALTY,
-        "threshold_min": qd.THRESHOLD_MIN,
-        "objects": None if objects is None else [getattr(one, "name", str(one)) for one in objects],
-        **options,
-        "ranges": ranges,
-        "design": base,
-        "parameters": [
-            {"path": path, "unit": p.unit, "low": p.low, "high": p.high, "integer": p.integer} for path, p in parameters
-        ],
-        "versions": versions(),
-    }
-
-
-@cache
-def versions() -> Mapping[str, str]:
-    """Return the versions that a result depends on."""
-    from finqd.provenance import versions as versions_of_simulation
-
-    return {"python": sys.version.split()[0], "ribs": version("ribs"), **versions_of_simulation()}
-
-
-def write_archive(
-    out: Path,
-    archive: GridArchive,
-    records: Sequence[qd.Record],
-    ranges: qd.Ranges,
-    parameters: Parameters,
-    decode: Callable[[np.ndarray, int], Design | TaskFailure],
+def write_derived(
+    log: RunLog, archive: GridArchive, written: dict[tuple[int, ...], int], *, always: bool = False
 ) -> None:
-    """Write the archive as a table and as design files, each file whole or not at all."""
-    write_whole(out / "archive.csv", qd.archive_table(archive, records, ranges, parameters))
-    (out / "elites").mkdir(exist_ok=True)
-    for cell, record in qd.elites(archive, records):
-        design = decode(np.array(record["unit"]), record["index"])
+    """Write the archive as a table and as design files, and with ``always`` the pictures, each whole or not at all.
+
+    written: cell -> evaluation of the design files that are there, brought up to date here. Without ``always`` not more
+    often than once a minute. A full disk is a warning: these files can be made again.
+    """
+    folder = log.run.folder
+    now = time.monotonic()
+    if not always and now - _last.get(folder, -WRITE_EVERY_S) < WRITE_EVERY_S:
+        return
+    _last[folder] = now
+    try:
+        _write_elites(log, archive, written)
+        if always:
+            from finqd.search_plots import draw
+
+            draw(folder, archive, log.told_records(0, log.told), log.run.ranges)
+    except OSError as error:
+        place = error.filename or folder
+        warnings.warn(f"{place}: cannot be written ({error.strerror or error}); the log is whole", stacklevel=2)
+
+
+def _write_elites(log: RunLog, archive: GridArchive, written: dict[tuple[int, ...], int]) -> None:
+    run = log.run
+    found = qd.elites(archive, log.elite_records(qd.elite_indices(archive)))
+    write_whole(run.folder / "archive.csv", qd.archive_table(found, run.ranges, run.parameters))
+    (run.folder / "elites").mkdir(exist_ok=True)
+    for cell, record in found:
+        if written.get(cell) == record["index"]:
+            continue
+        design = decoded(np.array(record["unit"]), record["index"], base=run.base, seed=run.settings["seed"])
         assert isinstance(design, Design)  # it was evaluated
         name = "_".join(["cell", *(f"{i:02d}" for i in cell)])
-        write_whole(out / "elites" / f"{name}.json", design.to_json())
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file, whole or not at all."""
-    write_whole(path, json.dumps(plain(content), indent=2, ensure_ascii=False) + "\n")
+        write_whole(run.folder / "elites" / f"{name}.json", design.to_json())
+        written[cell] = record["index"]

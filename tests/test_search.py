@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 import time
 from dataclasses import dataclass
@@ -14,8 +13,9 @@ import pytest
 from finqd import archive as qd
 from finqd.design import Design
 from finqd.errors import InputError, MissingLibraryError
-from finqd.runlog import RunLog, read_log
-from finqd.search import _new_scheduler, optimise, reflected
+from finqd.algorithms import ALGORITHMS, new_scheduler
+from finqd.runlog import RunLog, read_run
+from finqd.search import optimise, reflected
 
 BLADE = '''
 from dataclasses import dataclass
@@ -141,14 +141,13 @@ def table(folder):
 def test_a_search_of_a_foreign_finger_writes_everything(search, tmp_path):
     seen = []
     result = search(iterations=3, jobs=2, progress=lambda name, fraction: seen.append((name, fraction)))
-    log = read_log(tmp_path / "out/evaluations.jsonl")
-    assert sorted(line["index"] for line in log) == list(range(18))
-    by_index = {line["index"]: line for line in log}
-    assert [by_index[i] for i in range(18)] == list(result.records)
+    run = read_run(tmp_path / "out")
+    log = run.records()
+    assert [record["index"] for record in log] == list(range(18)) and log == result.records
     assert all(line["iteration"] == line["index"] // 6 for line in log)
     first = log[0]
     assert {"unit", "parameters", "design_digest", "fitness", "margin", "objective", "features", "objects"} < set(first)
-    assert {"status", "reason", "seconds", "seed", "versions", "emitter"} < set(first)
+    assert {"status", "reason", "seconds", "seed", "versions", "emitter", "host", "preset", "attempts"} < set(first)
     assert list(first["parameters"])[:2] == ["fingers[0].length_mm", "fingers[0].layer_count"]
     assert set(first["objects"]) == set(NAMES) and first["versions"]["ribs"].startswith("0.")
 
@@ -162,9 +161,13 @@ def test_a_search_of_a_foreign_finger_writes_everything(search, tmp_path):
         assert qd.measure_features(design)["volume_mm3"] == pytest.approx(float(row["volume_mm3"]))
     assert len(os.listdir(tmp_path / "out/elites")) == len(rows)
 
-    run = json.loads((tmp_path / "out/run.json").read_text())
-    assert run["status"] == "finished" and run["evaluations_told"] == 18 and run["seed"] == 0
-    assert run["parameters"][1] == {"path": "fingers[0].layer_count", "unit": "", "low": 1, "high": 4, "integer": True}
+    assert run.settings["seed"] == 0 and run.settings["algorithm"] == "cma_me" and run.settings["preset"] == "standard"
+    assert [path for path, _ in run.parameters][1] == "fingers[0].layer_count" and run.parameters[1][1].integer
+    assert run.ranges == RANGES and run.base["geometry"] == "blade" and run.elites() == result.elites
+    times = [record["finished_at"] for record in log]
+    assert all(time > 0 for time in times) and max(times[:6]) <= min(times[6:])
+    lines = (tmp_path / "out/progress.log").read_text().splitlines()
+    assert "18 of 18 designs, coverage" in lines[-1] and "0 failed" in lines[-1]
     for picture in ("heatmap", "coverage", "qd_score"):
         assert (tmp_path / f"out/{picture}.png").read_bytes()[:4] == b"\x89PNG"
     assert seen[-1] == ("iteration 3 of 3", 1.0) and all(0 < fraction <= 1 for _, fraction in seen)
@@ -175,9 +178,9 @@ def test_the_same_seed_gives_the_same_archive_with_one_and_two_jobs(search, tmp_
         search(name, **options)
     one, two, other = ((tmp_path / name / "archive.csv").read_bytes() for name in ("one", "two", "other"))
     assert one == two != other
-    logs = [read_log(tmp_path / name / "evaluations.jsonl") for name in ("one", "two")]
-    one, two = ({line.pop("index"): {**line, "seconds": 0} for line in log} for log in logs)
-    assert one == two
+    one, two = (read_run(tmp_path / name).records() for name in ("one", "two"))
+    varying = {"seconds": 0, "finished_at": 0}
+    assert [{**line, **varying} for line in one] == [{**line, **varying} for line in two]
 
 
 def test_failures_are_logged_with_their_reason_and_never_become_elites(search, tmp_path):
@@ -198,7 +201,8 @@ def test_failures_are_logged_with_their_reason_and_never_become_elites(search, t
     fine = {record["index"] for record in records if record["status"] == "ok"}
     assert 8 in fine
     assert {record["index"] for _, record in result.elites} <= fine and result.elites
-    assert len(read_log(tmp_path / "out/evaluations.jsonl")) == 12
+    assert len(read_run(tmp_path / "out").records()) == 12
+    assert [record["attempts"] for record in records][:3] == [2, 1, 1]  # only a crash may come from elsewhere
     assert result.archive.stats.coverage == len(result.elites) / 36
 
 
@@ -232,12 +236,13 @@ def test_an_interrupted_search_leaves_log_archive_and_pictures(search, tmp_path)
 
     with pytest.raises(KeyboardInterrupt):
         search(iterations=3, jobs=2, progress=stop)
-    log = read_log(tmp_path / "out/evaluations.jsonl")
-    assert 6 < len(log) < 12 and {0, 1, 2, 3, 4, 5} < {line["index"] for line in log}
+    run = read_run(tmp_path / "out")
+    assert len(run.records()) == 6
+    with RunLog(tmp_path / "out") as log:
+        known = log.evaluations(0, 18)
+    assert 6 < len(known) < 12  # what was finished of the second round is kept
     rows = table(tmp_path / "out")
     assert rows and {int(row["evaluation"]) for row in rows} <= set(range(6))  # what was told, nothing half told
-    run = json.loads((tmp_path / "out/run.json").read_text())
-    assert run["status"] == "interrupted" and run["evaluations_told"] == 6
     assert (tmp_path / "out/heatmap.png").exists() and len(os.listdir(tmp_path / "out/elites")) == len(rows)
     assert not [path for path in (tmp_path / "out").iterdir() if path.name.endswith(".part")]
 
@@ -246,8 +251,7 @@ def test_an_interrupted_search_leaves_log_archive_and_pictures(search, tmp_path)
 def test_what_is_wrong_for_every_design_is_raised_not_searched(search, tmp_path, wrong, error):
     with pytest.raises(error, match="hole|libGLU"):
         search(evaluate=wrong, batch=3)
-    log = read_log(tmp_path / "out/evaluations.jsonl")
-    assert len(log) == 3 and {line["status"] for line in log} <= {"error", "invalid"}
+    assert read_run(tmp_path / "out").records() == ()  # nothing was found out about a design
 
 
 # objective, archive, scheduler ----------------------------------------------------------------------------------------
@@ -269,7 +273,7 @@ def record(index, objective, *, volume=50e3, workspace=1500.0, status="ok"):
 
 def archive_and_scheduler(batch):
     archive = qd.new_archive(3, RANGES, cells=5, seed=np.random.SeedSequence(0))
-    return archive, _new_scheduler(archive, batch, np.random.SeedSequence(1))
+    return archive, new_scheduler("cma_me", archive, batch, np.random.SeedSequence(1))
 
 
 def test_ties_keep_the_first_and_a_worse_design_never_replaces_an_elite():
@@ -313,7 +317,7 @@ def test_the_curves_end_where_the_archive_does(search):
 def test_all_designs_lie_in_the_cube_even_from_a_corner(search):
     """ribs' own bounds never return from a corner of a space with 28 dimensions: half of each sample lies outside."""
     archive = qd.new_archive(28, RANGES, cells=5, seed=np.random.SeedSequence(0))
-    scheduler = _new_scheduler(archive, 4, np.random.SeedSequence(1))
+    scheduler = new_scheduler("cma_me", archive, 4, np.random.SeedSequence(1))
     scheduler.emitters[0]._opt.reset(np.zeros(28))
     units = scheduler.ask()
     assert np.all((units >= 0) & (units <= 1)) and units.std() > 0.05
@@ -383,7 +387,7 @@ def test_bad_options_get_one_sentence_and_no_folder(search, tmp_path, options, s
 def test_a_folder_that_holds_something_is_left_alone(search, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/evaluations.jsonl").write_text("dear to me\n")
-    with pytest.raises(InputError, match="out: is not empty, and a search cannot be resumed yet; name a new folder"):
+    with pytest.raises(InputError, match="out: is not empty, and holds no run to go on with; name a new folder"):
         search()
     assert os.listdir(tmp_path / "out") == ["evaluations.jsonl"]
     assert (tmp_path / "out/evaluations.jsonl").read_text() == "dear to me\n"
@@ -393,21 +397,3 @@ def test_a_folder_that_cannot_be_is_refused(search, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write to this folder"):
         search(tmp_path / "file" / "out")
-
-
-# the log --------------------------------------------------------------------------------------------------------------
-
-
-def test_a_log_survives_a_cut_in_its_last_line_and_is_never_overwritten(tmp_path):
-    path = tmp_path / "log.jsonl"
-    with RunLog(path) as log:
-        log.append({"index": 0, "unit": np.array([0.5]), "fitness": np.float64("nan"), "held": np.bool_(True)})
-        assert read_log(path) == [{"index": 0, "unit": [0.5], "fitness": None, "held": True}]  # there at once
-        log.append({"index": np.int64(1), "cell": (1, 2)})
-    text = path.read_text()
-    path.write_text(text[:-5])
-    assert [line["index"] for line in read_log(path)] == [0]
-    with pytest.raises(FileExistsError):
-        RunLog(path)
-    with pytest.raises(TypeError, match="plain values, not set"), RunLog(tmp_path / "other.jsonl") as log:
-        log.append({"what": {1, 2}})
