@@ -143,6 +143,8 @@ class Inline:
                 with one_blas_thread(), _alarm(time_limit_s):
                     result = call(function, task, partial(board.move, index))
             except _TimeUp:
+                if time_limit_s is None:
+                    raise  # the limit of the task that this one is part of
                 result = late(time_limit_s)
             board.put(index, result)
         return board.results

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import pickle
 import queue
 import time
 import uuid
@@ -57,7 +58,7 @@ def open_dask(scheduler: str | None, *, jobs: int, patience_s: float = PATIENCE_
         logging.getLogger(name).setLevel(logging.CRITICAL)  # they print tracebacks of what is one sentence here
     if scheduler is None:
         cluster = distributed.LocalCluster(  # as threads: the evaluations are processes anyway
-            n_workers=jobs, threads_per_worker=1, processes=False, dashboard_address=None, memory_limit=0,
+            n_workers=jobs, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", memory_limit=0,
         )
         client = distributed.Client(cluster, set_as_default=False)
         return Dask(client, where="the embedded cluster", cluster=cluster, patience_s=patience_s)
@@ -98,7 +99,7 @@ class Dask:
         try:
             for index, task in enumerate(tasks):
                 futures[index] = self._client.submit(
-                    _evaluate, cloudpickle.dumps((function, task)), index, topic, dict(versions()),
+                    _entry(), cloudpickle.dumps((function, task)), index, topic, dict(versions()),
                     {"time_limit_s": time_limit_s, "retries": retries}, key=f"{topic}-{index}", pure=False,
                 )
                 futures[index].add_done_callback(partial(_note, events, index))
@@ -152,7 +153,7 @@ class Dask:
             raise self._gone()
         if error is not None:  # of dask or of finqd there, never of the evaluation
             said = " ".join(str(error.__cause__ or error).split())
-            raise WorkersError(f"a worker of {self._where} cannot run this finqd ({said}); install the same one there")
+            raise WorkersError(f"a worker of {self._where} cannot run finqd ({said})")
         kind, value, crashes = future.result()
         if kind == "unlike":
             raise WorkersError(f"the dask worker {value}; install the same one everywhere")
@@ -181,6 +182,19 @@ def _note(events: queue.SimpleQueue, index: int, future: Future) -> None:
 _idle: queue.SimpleQueue[Processes] = queue.SimpleQueue()  # each with one process, for the next evaluation here
 
 
+def _entry() -> Callable[..., Any]:
+    """Return `_evaluate` as something that travels by value: a worker without finqd says so, instead of dying of it."""
+
+    def evaluate(*arguments: Any) -> Any:
+        try:
+            from finqd.workers_dask import _evaluate
+        except ImportError as error:
+            return "unlike", f"on {__import__('socket').gethostname()} has no such finqd ({error})", []
+        return _evaluate(*arguments)
+
+    return evaluate
+
+
 def _evaluate(
     payload: bytes, index: int, topic: str, expected: Mapping[str, str], limits: Mapping[str, Any]
 ) -> tuple[str, Any, list[TaskFailure]]:
@@ -207,7 +221,7 @@ def _evaluate(
     own = _one_idle() or Processes(1)
     try:
         (result,) = own.run(
-            _call_packed, [(payload, expected)], **limits, on_progress=report,
+            _call_received, [_Sent(payload, expected)], **limits, on_progress=report,
             on_retry=lambda _, crash: crashes.append(crash), on_tick=partial(_still_wanted, worker, key),
         )
     finally:
@@ -225,13 +239,27 @@ def _still_wanted(worker: Any, key: Any) -> None:
         raise RuntimeError("nobody waits for this evaluation any more")
 
 
-def _call_packed(task: tuple[bytes, Mapping[str, str]], *, progress: Callable[[float], None]) -> tuple[str, Any]:
-    """Call what the driver sent, in the evaluation's process; the dask worker passes the result on without a look."""
-    payload, expected = task
-    if versions() != expected:
-        return "unlike", unlike(versions(), expected)
-    function, content = unpacked(payload)
-    return "done", packed(call(function, content, progress))
+class _Sent:
+    """What the driver sent: bytes on the dask worker, a function and a task (`_received`) in the evaluation's process.
+
+    So the imports that this takes come before the task begins, and its time limit with it.
+    """
+
+    def __init__(self, payload: bytes, expected: Mapping[str, str]) -> None:
+        self.content = payload, expected
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _received, self.content
+
+
+def _received(payload: bytes, expected: Mapping[str, str]) -> tuple[Any, Any]:
+    return pickle.loads(payload) if versions() == expected else (None, unlike(versions(), expected))
+
+
+def _call_received(received: tuple[Any, Any], *, progress: Callable[[float], None]) -> tuple[str, Any]:
+    """Call a function that was sent; the dask worker passes the packed result on without a look."""
+    function, task = received
+    return ("unlike", task) if function is None else ("done", packed(call(function, task, progress)))
 
 
 def unlike(there: Mapping[str, str], here: Mapping[str, str]) -> str:
