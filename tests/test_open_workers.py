@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -45,11 +46,11 @@ def working(folder):
 class Cluster:
     """A scheduler and two workers by the command line, as docs/cluster.md has them; one of them with a nanny."""
 
-    def __init__(self, folder, workers=2):
+    def __init__(self, folder, workers=2, scheduler=("scheduler", "--port", "0", "--no-dashboard")):
         folder.mkdir(exist_ok=True)
         self.file = folder / "scheduler.json"
         self.log = (folder / "log").open("w")
-        self.scheduler = self.start("scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", self.file)
+        self.scheduler = self.start(*scheduler, "--scheduler-file", self.file)
         self.workers = [
             self.start("worker", "--scheduler-file", self.file, "--nthreads", "1", "--memory-limit", "0",
                        "--no-dashboard", *(["--no-nanny"] if i else []), "--local-directory", folder)
@@ -299,6 +300,23 @@ def test_a_dask_worker_that_is_killed_costs_nothing_but_time(tmp_path):
         assert found == ["fine", "done"] and len(working(tmp_path)) == 2
     finally:
         three.close()
+
+
+def test_the_lines_of_the_manual(tmp_path):
+    """docs/cluster.md's scheduler and, twice, its worker; only host, port and number of threads are others."""
+    lines = [line.split() for line in (ROOT / "docs" / "cluster.md").read_text().splitlines() if line[:9] == "    dask "]
+    assert [line[:2] for line in lines] == [["dask", "scheduler"], ["dask", "worker"]]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    scheduler, worker = ([word.replace("HOST", "127.0.0.1").replace("8786", port) for word in line] for line in lines)
+    manual = Cluster(tmp_path / "manual", workers=0, scheduler=[*scheduler[1:], "--no-dashboard"])
+    manual.workers += [manual.start(*worker[1:], "--no-dashboard") for _ in range(2)]
+    try:
+        with open_workers("dask", scheduler=f"tcp://127.0.0.1:{port}") as workers:
+            assert workers.run(square, range(5)) == [0, 1, 4, 9, 16]
+    finally:
+        manual.close()
 
 
 SCRIPT = """
