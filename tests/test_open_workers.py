@@ -304,7 +304,8 @@ def test_a_dask_worker_that_is_killed_costs_nothing_but_time(tmp_path):
 
 def test_the_lines_of_the_manual(tmp_path):
     """docs/cluster.md's scheduler and, twice, its worker; only host, port and number of threads are others."""
-    lines = [line.split() for line in (ROOT / "docs" / "cluster.md").read_text().splitlines() if line[:9] == "    dask "]
+    manual_text = (ROOT / "docs" / "cluster.md").read_text()
+    lines = [line.split() for line in manual_text.splitlines() if line.startswith("    dask ")]
     assert [line[:2] for line in lines] == [["dask", "scheduler"], ["dask", "worker"]]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
