@@ -138,15 +138,16 @@ class Inline:
         """Return the result of each task, see `Workers`. A task that crashes takes this process along."""
         check_limits(time_limit_s=time_limit_s, retries=retries)
         board = Board.of(tasks, retries=retries, on_result=on_result, on_progress=on_progress, on_retry=on_retry)
-        for index, task in enumerate(tasks):
-            try:
-                with one_blas_thread(), _alarm(time_limit_s):
-                    result = call(function, task, partial(board.move, index))
-            except _TimeUp:
-                if time_limit_s is None:
-                    raise  # the limit of the task that this one is part of
-                result = late(time_limit_s)
-            board.put(index, result)
+        with one_blas_thread():
+            for index, task in enumerate(tasks):
+                try:
+                    with _alarm(time_limit_s):
+                        result = call(function, task, partial(board.move, index))
+                except _TimeUp:
+                    if time_limit_s is None:
+                        raise  # the limit of the task that this one is part of
+                    result = late(time_limit_s)
+                board.put(index, result)
         return board.results
 
     def close(self) -> None:

@@ -1,0 +1,186 @@
+"""Evaluate the elites of a search again, under other conditions: is the map to be trusted?
+
+`recheck_run` draws perturbations (`finqd.perturbations`), evaluates each elite under each of them, through the same
+workers as the search, and writes each result into the run's log as it comes; `finqd.trust` says what they mean. It goes
+on where it was stopped, and what was evaluated before, by content, is not evaluated again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from finqd import archive as qd
+from finqd.design import Design
+from finqd.errors import InputError, MissingLibraryError
+from finqd.perturbations import Scheme, perturbed
+from finqd.runlog import plain
+from finqd.trust import Trust, trust
+from finqd.workers import TaskFailure, Workers
+
+if TYPE_CHECKING:
+    from finqd.runlog import Run, RunLog
+
+Record = Mapping[str, Any]
+Progress = Callable[[str, float], None]
+
+
+#: of an evaluation, what a row has too
+RESULT = ("status", "reason", "details", "fitness", "margin", "objective", "features", "objects", "seconds", "host",
+          "versions", "attempts")  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """One elite under one perturbation."""
+
+    record: Record
+    number: int
+    perturbation: Mapping[str, float]
+    design: Design | TaskFailure  # a failure: there is no such design
+
+    @cached_property
+    def content(self) -> tuple[Any, ...] | None:
+        """What a result depends on, beside the run's objects."""
+        return (self.design.digest(), self.record["preset"]) if isinstance(self.design, Design) else None
+
+
+def recheck_run(
+    run: Run, log: RunLog, *, count: int, workers: Workers, evaluate: Callable[..., Any], scheme: Scheme | None = None,
+    time_limit_s: float | None = 3600.0, progress: Progress | None = None,
+) -> Trust:
+    """Evaluate each elite of ``run`` under the first ``count`` perturbations of ``scheme``; return what that says.
+
+    evaluate: called as ``evaluate(design, preset=..., progress=...)`` where a worker is, for each elite with the preset
+        that it was told with; what it returns is what a search's record has of it (`finqd.search`)
+    progress: called as ``progress("recheck 3 of 80", fraction)``
+
+    Raises InputError if there is no elite, and whatever input an evaluation finds wrong (a design that was evaluated
+    before is not at fault for an object's file that is gone, or a library): nothing is written for it then.
+    """
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InputError(f"must be a whole number from 1 upwards, got {count!r}", where="recheck")
+    scheme, elites, rows = scheme or Scheme(), run.elites(), list(run.rechecks())
+    if not elites:
+        raise InputError("has no elite to recheck", where=str(run.folder))
+    known = {(row["design_digest"], row["preset"]): row for row in rows if row["status"] in ("ok", "failed")}
+    left = []
+
+    def keep(task: _Task, result: Any) -> None:
+        if isinstance(result, TaskFailure) and isinstance(result.exception, (InputError, MissingLibraryError)):
+            raise result.exception
+        rows.append(_row(task, result, scheme, run))
+        log.append_recheck(rows[-1])
+
+    for task in _open_tasks(run, rows, [record for _, record in elites], count=count, scheme=scheme):
+        found = known.get(task.content) or _found(task, log, run)
+        if found is not None:
+            keep(task, found)
+        elif isinstance(task.design, TaskFailure):
+            keep(task, task.design)
+        else:
+            left.append(task)
+    _evaluate_all(left, keep, workers=workers, evaluate=evaluate, time_limit_s=time_limit_s, progress=progress)
+    return trust(
+        elites, rows, archive=run.archive(), features=tuple(run.ranges), scheme=scheme.to_dict(), count=count
+    )
+
+
+def trust_of(run: Run) -> Trust | None:
+    """Return what a run's rechecks say, of those by the scheme that was used last; None if there are none."""
+    rows = run.rechecks()
+    if not rows:
+        return None
+    scheme = rows[-1]["scheme"]
+    count = 1 + max(row["number"] for row in rows if row["scheme"] == scheme)
+    return trust(run.elites(), rows, archive=run.archive(), features=tuple(run.ranges), scheme=scheme, count=count)
+
+
+def _open_tasks(
+    run: Run, rows: Sequence[Record], records: Sequence[Record], *, count: int, scheme: Scheme
+) -> list[_Task]:
+    """Return what is not in the log yet, perturbation by perturbation: stopped early, all elites have about as many."""
+    done = {(row["index"], row["number"]) for row in rows if row["scheme"] == scheme.to_dict()}
+    designs = {record["index"]: _design(run, record) for record in records}
+    return [
+        _Task(record=record, number=number, perturbation=perturbation,
+              design=_under(designs[record["index"]], perturbation, record["preset"]))
+        for number, perturbation in enumerate(scheme.draw(count))
+        for record in records
+        if (record["index"], number) not in done
+    ]
+
+
+def _design(run: Run, record: Record) -> Design:
+    """Return an elite's design. Raises InputError if it is not the one that was evaluated."""
+    design = Design.from_unit_vector(np.array(record["unit"]), **run.base, name=f"evaluation {record['index']}")
+    if design.digest() != record["design_digest"]:
+        raise InputError(
+            f"evaluation {record['index']} is another design now: the finger type or its defaults have changed since",
+            where=str(run.folder),
+        )
+    return design
+
+
+def _under(design: Design, perturbation: Mapping[str, float], preset: str) -> Design | TaskFailure:
+    try:
+        return perturbed(design, perturbation, preset=preset)
+    except InputError as error:  # one of its values lies at the edge of what a design may hold
+        return TaskFailure(kind="invalid", reason=str(error))
+
+
+def _found(task: _Task, log: RunLog, run: Run) -> Record | None:
+    """Return what the search knows of this very content."""
+    return None if task.content is None else log.found(*task.content, run.settings["objects"])
+
+
+def _evaluate_all(
+    tasks: Sequence[_Task], keep: Callable[[_Task, Any], None], *, workers: Workers, evaluate: Callable[..., Any],
+    time_limit_s: float | None, progress: Progress | None,
+) -> None:
+    fractions, finished = np.zeros(len(tasks)), 0
+
+    def move(index: int, fraction: float) -> None:
+        fractions[index] = fraction
+        if progress is not None:
+            progress(f"recheck {min(finished + 1, len(tasks))} of {len(tasks)}", float(fractions.mean()))
+
+    def take(index: int, result: Any) -> None:
+        nonlocal finished
+        keep(tasks[index], result)
+        finished += 1
+        move(index, 1.0)
+
+    workers.run(
+        partial(_evaluated, evaluate=evaluate), [(task.design, task.record["preset"]) for task in tasks],
+        time_limit_s=time_limit_s, on_result=take, on_progress=move,
+    )
+
+
+def _evaluated(task: tuple[Design, str], *, evaluate: Callable[..., Any], progress: Callable[[float], None]) -> Any:
+    design, preset = task
+    return evaluate(design, preset=preset, progress=progress)
+
+
+def _row(task: _Task, result: Any, scheme: Scheme, run: Run) -> dict[str, Any]:
+    """Return what the log says of one recheck."""
+    row: dict[str, Any] = {
+        "index": task.record["index"], "number": task.number, "perturbation": dict(task.perturbation),
+        "scheme": scheme.to_dict(), "preset": task.record["preset"],
+        "design_digest": task.content[0] if task.content else None,
+        **dict.fromkeys(RESULT), "objective": qd.PENALTY, "features": {}, "objects": {}, "attempts": 1,
+    }
+    if isinstance(result, TaskFailure):
+        return {**row, "status": result.kind, "reason": result.reason, "details": result.details,
+                "attempts": result.attempts}
+    row |= {key: value for key, value in result.items() if key in RESULT}
+    if "status" not in result:  # it was evaluated just now
+        reason = qd.why_failed(result, tuple(run.ranges))
+        row |= {"status": "failed" if reason else "ok", "reason": reason}
+        if not reason:
+            row["objective"] = qd.objective(row["fitness"], row["margin"], max(1, len(row["objects"])))
+    return plain(row)

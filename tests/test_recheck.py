@@ -1,0 +1,212 @@
+"""`finqd.recheck`: elites again under other conditions, in the log of their run."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from finqd.archive import new_archive, objective
+from finqd.design import Design
+from finqd.errors import InputError
+from finqd.perturbations import ADDED, RANGES, Scheme
+from finqd.recheck import recheck_run, trust_of
+from finqd.runlog import plain
+from finqd.trust import Share
+from finqd.workers import open_workers
+
+OBJECTS = ["cube", "disk", "sphere"]
+AXES = {"workspace_mm2": (1000.0, 2200.0), "volume_mm3": (10_000.0, 90_000.0)}
+NOTHING = {name: (0.0, 0.0) if name in ADDED else (1.0, 1.0) for name in RANGES}
+BASE = {"protocol": {"hold_s": 2.0}}
+
+
+def result_of(held, features):
+    fitness = sum(held) / len(held)
+    return {"fitness": fitness, "margin": 0.25, "features": features, "seconds": 0.0,
+            "objects": {name: {"status": "ok", "held": bool(one)} for name, one in zip(OBJECTS, held)}}
+
+
+def features_of(design):
+    return {"workspace_mm2": design.workspace * 1e6, "volume_mm3": 500.0 * sum(f["length_mm"] for f in design.fingers)}
+
+
+def steady(design, *, preset, progress=None):
+    """A stand-in that holds the same objects under all conditions."""
+    number = round(100 * design.spacing_mm)
+    return result_of([number % 2, number % 3 > 0, 1], features_of(design))
+
+
+def flipping(design, *, preset, progress=None, rate=0.3):
+    """A stand-in each of whose verdicts differs with a known probability from that under nominal conditions."""
+    bits = np.random.default_rng(int(hashlib.sha256(design.digest().encode()).hexdigest()[:12], 16)).random(3)
+    raw = [one["held"] for one in steady(design, preset=preset)["objects"].values()]
+    return result_of([bool(one) ^ bool(bit < rate) for one, bit in zip(raw, bits)], features_of(design))
+
+
+def must_not_run(design, *, preset, progress=None):
+    raise AssertionError("it was evaluated before")
+
+
+def object_gone(design, *, preset, progress=None):
+    raise InputError("there is no such file", where="part.stl")
+
+
+def fragile(design, *, preset, progress=None):
+    """A stand-in that fails with less friction."""
+    if design.protocol.friction_coefficient < 0.6:
+        raise ValueError("does not converge")
+    return steady(design, preset=preset)
+
+
+class Log:
+    """Stands for a run's log."""
+
+    def __init__(self, run, room=10**9):
+        self.run, self.room = run, room
+
+    def append_recheck(self, row):
+        if len(self.run.rows) >= self.room:
+            raise KeyboardInterrupt
+        self.run.rows.append(row)
+
+    def found(self, digest, preset, objects):
+        assert objects == OBJECTS
+        same = [r for _, r in self.run.elites() if (r["design_digest"], r["preset"]) == (digest, preset)]
+        return same[0] if same else None
+
+
+def run_of(count):
+    """Return a run of so many elites, evaluated by `steady`."""
+    archive = new_archive(28, AXES, cells=40, seed=np.random.SeedSequence(0))
+    elites = []
+    for i, unit in enumerate(qmc.Sobol(28, scramble=True, seed=0).random(8)[:count]):
+        design = Design.from_unit_vector(unit, **BASE)
+        result = steady(design, preset="draft")
+        (cell,) = archive.int_to_grid_index([archive.index_of_single(list(result["features"].values()))]).tolist()
+        elites.append((tuple(cell), plain({
+            **result, "index": 3 * i, "unit": unit, "preset": "draft", "status": "ok", "reason": "",
+            "design_digest": design.digest(), "objective": objective(result["fitness"], 0.25, 3),
+        })))
+    assert len({cell for cell, _ in elites}) == count
+    rows = []
+    return SimpleNamespace(folder="RUN", base=BASE, ranges=AXES, settings={"objects": OBJECTS}, rows=rows,
+                           elites=lambda: elites, rechecks=lambda: tuple(rows), archive=lambda: archive)
+
+
+def rechecked(run, evaluate, *, count=4, room=10**9, kind="inline", **options):
+    with open_workers(kind, jobs=2) as workers:
+        return recheck_run(run, Log(run, room), count=count, workers=workers, evaluate=evaluate, **options)
+
+
+def test_without_a_perturbation_the_raw_numbers_come_again_and_nothing_is_evaluated():
+    run = run_of(4)
+    found = rechecked(run, must_not_run, scheme=Scheme(ranges=NOTHING))
+    assert found.complete and found.corrected == found.raw and found.raw["coverage"] == 4 / 1600
+    assert all(one.corrected == one.raw and one.flips.rate == 0.0 and one.success.rate == 1.0 for one in found.elites)
+    assert all(row["features"] == record["features"] and row["objects"] == record["objects"]
+               for row in run.rows for _, record in run.elites() if record["index"] == row["index"])
+
+
+def test_conditions_that_change_no_verdict_give_the_raw_numbers_exactly():
+    run = run_of(4)
+    found = rechecked(run, steady)
+    assert found.complete and found.corrected == found.raw and len(run.rows) == 16
+    assert len({row["design_digest"] for row in run.rows}) == 16
+
+
+def test_rows_say_what_was_done():
+    run, scheme = run_of(2), Scheme(seed=5, ranges={"mesh_size": None})
+    rechecked(run, steady, count=3, scheme=scheme)
+    assert [(row["index"], row["number"]) for row in run.rows] == [(i, k) for k in range(3) for i in (0, 3)]
+    for row in run.rows:
+        assert row["perturbation"] == scheme.draw(3)[row["number"]] and "mesh_size" not in row["perturbation"]
+        assert row["scheme"] == scheme.to_dict() and row["preset"] == "draft" and row["status"] == "ok"
+
+
+def test_a_known_rate_of_flips_is_found_within_its_interval():
+    found = rechecked(run_of(4), partial(flipping, rate=0.3), count=32)
+    by_object, by_elite = ([one.flips for one in ones] for ones in (found.objects, found.elites))
+    assert sum(one.part for one in by_object) == sum(one.part for one in by_elite)
+    low, high = Share(part=sum(one.part for one in by_elite), whole=4 * 32 * 3).interval
+    assert low < 0.3 < high and high - low < 0.1
+    assert all(one.rate == pytest.approx(0.3, abs=0.15) for one in (*by_object, *by_elite))
+    assert found.corrected["qd_score"] < found.raw["qd_score"]
+
+
+def test_an_interrupted_recheck_goes_on_to_the_same_rows():
+    whole, pieces = run_of(3), run_of(3)
+    expected = rechecked(whole, flipping, count=5)
+    for room in (4, 10):
+        with pytest.raises(KeyboardInterrupt):
+            rechecked(pieces, flipping, count=5, room=room)
+        assert len(pieces.rows) == room and not trust_of(pieces).complete
+    assert rechecked(pieces, flipping, count=5).to_dict() == expected.to_dict()
+    assert pieces.rows == whole.rows
+    assert rechecked(pieces, must_not_run, count=5).to_dict() == trust_of(pieces).to_dict() == expected.to_dict()
+
+
+def test_more_rechecks_keep_the_first_ones_and_another_seed_begins_anew():
+    run = run_of(2)
+    rechecked(run, steady, count=2)
+    first = list(run.rows)
+    rechecked(run, steady, count=6)
+    assert run.rows[:4] == first and len(run.rows) == 12
+    found = rechecked(run, steady, count=2, scheme=Scheme(seed=9))
+    assert len(run.rows) == 16 and found.complete and trust_of(run).scheme["seed"] == 9
+
+
+def test_processes_give_the_same_rows():
+    here, there = run_of(2), run_of(2)
+    assert rechecked(here, flipping).to_dict() == rechecked(there, flipping, kind="processes").to_dict()
+    order = {(row["index"], row["number"]): row for row in there.rows}
+    assert [order[row["index"], row["number"]] for row in here.rows] == here.rows
+
+
+def test_failures_are_rows_with_their_reason_and_count_as_nothing_held():
+    run = run_of(2)
+    found = rechecked(run, fragile, count=8)
+    failed = [row for row in run.rows if row["status"] == "error"]
+    assert 0 < len(failed) < 16 and all(row["reason"] == "ValueError: does not converge" for row in failed)
+    assert all(row["perturbation"]["friction"] < 1 for row in failed)
+    assert sum(one.failed for one in found.elites) == len(failed)
+    assert found.corrected["qd_score"] < found.raw["qd_score"]
+
+
+def test_what_is_no_fault_of_the_design_s_is_one_sentence_and_not_written():
+    run = run_of(2)
+    with pytest.raises(InputError, match="^part.stl: there is no such file$"):
+        rechecked(run, object_gone)
+    assert run.rows == []
+
+
+def test_a_run_of_another_finger_is_refused():
+    run = run_of(1)
+    run.elites()[0][1]["design_digest"] = "f" * 64
+    with pytest.raises(InputError, match="RUN: evaluation 0 is another design now: the finger type or its defaults"):
+        rechecked(run, steady)
+
+
+@pytest.mark.parametrize("count", [0, 1.5, True])
+def test_a_bad_number_gets_one_sentence(count):
+    with pytest.raises(InputError, match="recheck: must be a whole number from 1 upwards, got"):
+        rechecked(run_of(1), steady, count=count)
+
+
+def test_a_run_without_elites_gets_one_sentence():
+    run = run_of(1)
+    run.elites().clear()
+    assert trust_of(run) is None
+    with pytest.raises(InputError, match="^RUN: has no elite to recheck$"):
+        rechecked(run, steady)
+
+
+def test_progress_is_told():
+    seen = []
+    rechecked(run_of(2), steady, count=2, progress=lambda text, fraction: seen.append((text, fraction)))
+    assert [text for text, _ in seen] == ["recheck 2 of 4", "recheck 3 of 4", "recheck 4 of 4", "recheck 4 of 4"]
+    assert [fraction for _, fraction in seen] == [0.25, 0.5, 0.75, 1.0]
