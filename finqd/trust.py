@@ -24,10 +24,11 @@ DEFINITION = (
     "features with its mean objective; where two meet, the better mean stays. QD score: sum of the cells' "
     "objectives; coverage: share of cells filled; raw: those of the same elites as the search told them. A recheck "
     "that failed (no simulation finished, crash, time limit) counts as one that holds nothing, with objective 0; an "
-    "elite all of whose rechecks failed is in no cell. Success: share of rechecks in which an elite held at least "
-    "as many objects as raw; of an object, in which it was held. Flips: share of verdicts that differ from the raw "
-    "ones. Intervals: Wilson's, 95 %, made for independent trials; the perturbations are spread more evenly, and "
-    "are the same for all elites."
+    "elite all of whose rechecks failed is in no cell. Success: share of verdicts (recheck by object) that are "
+    "held. Keeps: share of rechecks in which an elite held at least as many objects as raw. Flips: share of "
+    "verdicts that differ from the raw ones. Intervals: Wilson's, 95 %, made for independent trials: perturbations "
+    "are spread more evenly than those, but verdicts of one recheck, and elites under one perturbation, go "
+    "together."
 )
 
 Record = Mapping[str, Any]
@@ -74,8 +75,9 @@ class ObjectTrust:
 class EliteTrust:
     """One elite. ``corrected``: its mean objective, None without rechecks; ``cell``: where it is in the raw map.
 
-    success: rechecks in which it held at least as many objects as raw; flips: verdicts (recheck by object) that differ
-    from the raw ones; failed: rechecks that failed; fitness: mean share of objects held; objects: each object's
+    success: verdicts (recheck by object) that are held, whose rate is the mean fitness if that is the share of objects
+    held; flips: verdicts that differ from the raw ones; keeps: rechecks in which it held at least as many objects as
+    raw; failed: rechecks that failed; objects: each object's
     """
 
     index: int
@@ -87,6 +89,7 @@ class EliteTrust:
     raw_fitness: float
     fitness: float | None
     success: Share
+    keeps: Share
     flips: Share
     objects: tuple[ObjectTrust, ...]
 
@@ -96,7 +99,7 @@ class EliteTrust:
             "index": self.index, "cell": list(self.cell), "rechecks": self.rechecks, "failed": self.failed,
             "objective": {"raw": self.raw, "corrected": self.corrected},
             "fitness": {"raw": self.raw_fitness, "mean": self.fitness},
-            "success": self.success.to_dict(), "flips": self.flips.to_dict(),
+            "success": self.success.to_dict(), "keeps": self.keeps.to_dict(), "flips": self.flips.to_dict(),
             "objects": {one.name: one.to_dict() for one in self.objects},
         }
 
@@ -178,7 +181,8 @@ def _elite(cell: Cell, record: Record, rows: Sequence[Record]) -> EliteTrust:
         index=record["index"], cell=cell, rechecks=count, failed=sum(row["status"] != "ok" for row in rows),
         raw=record["objective"], corrected=_mean([_or_zero(row, "objective") for row in rows]),
         raw_fitness=record["fitness"], fitness=_mean([_or_zero(row, "fitness") for row in rows]),
-        success=Share(part=sum(sum(_held(row, name) for name in names) >= n_raw for row in rows), whole=count),
+        success=Share(part=sum(held.values()), whole=count * len(names)),
+        keeps=Share(part=sum(sum(_held(row, name) for name in names) >= n_raw for row in rows), whole=count),
         flips=Share(part=sum(flips.values()), whole=count * len(names)),
         objects=tuple(
             ObjectTrust(name=name, raw=raw[name], held=Share(part=held[name], whole=count),

@@ -107,7 +107,7 @@ def test_without_a_perturbation_the_raw_numbers_come_again_and_nothing_is_evalua
     run = run_of(4)
     found = rechecked(run, must_not_run, scheme=Scheme(ranges=NOTHING))
     assert found.complete and found.corrected == found.raw and found.raw["coverage"] == 4 / 1600
-    assert all(one.corrected == one.raw and one.flips.rate == 0.0 and one.success.rate == 1.0 for one in found.elites)
+    assert all(one.corrected == one.raw and one.flips.rate == 0.0 and one.keeps.rate == 1.0 for one in found.elites)
     assert all(row["features"] == record["features"] and row["objects"] == record["objects"]
                for row in run.rows for _, record in run.elites() if record["index"] == row["index"])
 

@@ -145,7 +145,8 @@ def test_rechecks_that_give_the_same_give_the_raw_numbers_to_the_last_bit():
                           for one in elites for k in range(3)], count=3)
     assert found.complete and found.raw == found.corrected
     assert found.raw == {"qd_score": pytest.approx(sum(one["objective"] for one in elites)), "coverage": 0.07}
-    assert all(one.success.rate == 1.0 and one.flips.rate == 0.0 and one.corrected == one.raw for one in found.elites)
+    assert all(one.corrected == one.raw and one.success.rate == one.fitness for one in found.elites)
+    assert all(one.keeps.rate == 1.0 and one.flips.rate == 0.0 for one in found.elites)
 
 
 def test_scores_flips_and_success_by_hand():
@@ -154,9 +155,11 @@ def test_scores_flips_and_success_by_hand():
             row(1, 0, [1, 1, 1, 0], 0.35), row(1, 1, [0, 0, 0, 0], 0.35, status="timeout")]
     found = told(elites, rows)
     first, second = found.elites
-    assert first.fitness == 0.5 and first.success == Share(part=1, whole=2) and first.flips == Share(part=2, whole=8)
+    assert first.keeps == Share(part=1, whole=2) and first.success == Share(part=4, whole=8)
+    assert first.flips == Share(part=2, whole=8)
     assert first.corrected == pytest.approx((objective(0.25, 0.5, 4) + objective(0.75, 0.5, 4)) / 2)
-    assert second.failed == 1 and second.fitness == 0.375 and second.success == Share(part=0, whole=2)
+    assert (first.fitness, second.fitness, second.failed) == (0.5, 0.375, 1)
+    assert second.keeps == Share(part=0, whole=2) and second.success == Share(part=3, whole=8)
     assert second.flips == Share(part=5, whole=8)
     assert {one.name: one.held.part for one in found.objects} == {"a": 3, "b": 2, "c": 2, "d": 0}
     assert {one.name: one.flips.part for one in found.objects} == {"a": 1, "b": 2, "c": 2, "d": 2}
