@@ -73,6 +73,10 @@ def open_dask(scheduler: str | None, *, jobs: int, patience_s: float = PATIENCE_
     return Dask(client, where=scheduler, patience_s=patience_s)
 
 
+class Abandoned(Exception):
+    """An evaluation was given up, and is no failure."""
+
+
 class Dask:
     """The workers of one dask scheduler; see `finqd.workers.Workers`."""
 
@@ -96,34 +100,43 @@ class Dask:
         topic = f"finqd-{uuid.uuid4().hex}"
         self._client.subscribe_topic(topic, lambda event: events.put(("progress", *event[1])))
         futures: dict[int, Future] = {}
+
+        def submit(index: int) -> None:
+            futures[index] = self._client.submit(
+                _entry(), cloudpickle.dumps((function, tasks[index])), index, topic, dict(versions()),
+                {"time_limit_s": time_limit_s, "retries": retries}, key=f"{topic}-{uuid.uuid4().hex}", pure=False,
+            )
+            futures[index].add_done_callback(partial(_note, events, index))
+
         try:
-            for index, task in enumerate(tasks):
-                futures[index] = self._client.submit(
-                    _entry(), cloudpickle.dumps((function, task)), index, topic, dict(versions()),
-                    {"time_limit_s": time_limit_s, "retries": retries}, key=f"{topic}-{index}", pure=False,
-                )
-                futures[index].add_done_callback(partial(_note, events, index))
-            self._collect(board, futures, events)
+            for index in range(len(tasks)):
+                submit(index)
+            self._collect(board, futures, events, submit)
         finally:
             with suppress(Exception):  # of a client that has lost its scheduler
                 self._client.cancel(list(futures.values()), force=True)
                 self._client.unsubscribe_topic(topic)
         return board.results
 
-    def _collect(self, board: Board, futures: dict[int, Future], events: queue.SimpleQueue) -> None:
-        """Put the results on the board as they come."""
-        left, alone_since = set(futures), time.monotonic()
-        while left:
+    def _collect(
+        self, board: Board, futures: dict[int, Future], events: queue.SimpleQueue, submit: Callable[[int], None]
+    ) -> None:
+        """Put the results on the board as they come; submit again what a dask worker that closes has given up."""
+        alone_since = time.monotonic()
+        while futures:
             try:
                 kind, index, value = events.get(timeout=TICK_S)
             except queue.Empty:
                 alone_since = self._look_around(alone_since)
                 continue
-            if kind == "progress" and index in left:
+            if kind == "progress" and index in futures:
                 board.move(index, value)
             elif kind == "done":
-                left.discard(index)
-                self._take(board, index, futures.pop(index))
+                future = futures.pop(index)
+                if future.status == "error" and isinstance(future.exception(), Abandoned):
+                    submit(index)
+                else:
+                    self._take(board, index, future)
             alone_since = time.monotonic()
 
     def _look_around(self, alone_since: float) -> float:
@@ -236,7 +249,7 @@ def _still_wanted(worker: Any, key: Any) -> None:
     """Raise if nobody waits for the task: its driver has left, or another worker has taken it over."""
     task = worker.state.tasks.get(key)
     if worker.status.name in GONE or task is None or task.state in ("cancelled", "released", "forgotten"):
-        raise RuntimeError("nobody waits for this evaluation any more")
+        raise Abandoned("nobody waits for this evaluation any more, or the dask worker closes")
 
 
 class _Sent:

@@ -19,7 +19,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
-from finqd.errors import InputError
+from finqd.errors import InputError, WorkersError
 from finqd.workers_task import (
     WORKER_THREADS,
     Board,
@@ -38,6 +38,7 @@ from finqd.workers_task import (
 
 START_ALLOWANCE_S = 60.0  # a time limit begins when the task does; starting the interpreter may take this long
 TICK_S = 1.0
+GUARD = 'a script of your own must guard its main part with if __name__ == "__main__"'
 _starting = threading.Lock()  # several threads of a dask worker start processes, and the environment is theirs together
 
 
@@ -61,6 +62,7 @@ class Processes:
         """Return the result of each task, see `finqd.workers.Workers`.
 
         on_tick: called about once a second while tasks run; what it raises ends them
+        Raises WorkersError if processes die before they begin: no task is at fault then
         """
         check_limits(time_limit_s=time_limit_s, retries=retries)
         board = Board.of(tasks, retries=retries, on_result=on_result, on_progress=on_progress, on_retry=on_retry)
@@ -78,6 +80,8 @@ class Processes:
                         assert index is not None  # only busy workers are asked
                         if crash.kind != "crash":
                             board.put(index, crash)
+                        elif not worker.began and 0 < retries < board.attempts[index]:
+                            raise WorkersError(f"{crash.reason} before it began, each time; {GUARD}")
                         elif board.again(index, crash):
                             waiting.append((index, payload))
         except BaseException:
@@ -125,6 +129,7 @@ class _Worker:
         theirs.close()
         self.index: int | None = None
         self.payload = b""
+        self.began = False  # its interpreter is up, and it listens
         self.deadline = float("inf")
 
     def assign(self, index: int, payload: bytes, time_limit_s: float | None) -> None:
@@ -183,7 +188,9 @@ def _serve(worker: _Worker, board: Board, time_limit_s: float | None) -> TaskFai
     """Take what a busy worker has to say; return what became of its task if it is dead or must be."""
     while worker.index is not None:
         kind, value = worker.message()
-        if kind == "started":
+        if kind == "began":
+            worker.began = True
+        elif kind == "started":
             worker.deadline = float("inf") if time_limit_s is None else time.monotonic() + time_limit_s
         elif kind == "progress":
             board.move(worker.index, value)
@@ -206,6 +213,7 @@ def _work(pipe: connection.Connection) -> None:
     """The worker's main loop: a task in, messages and one result out, until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     _die_with_parent()
+    pipe.send(("began", None))
     while True:
         try:
             payload = pipe.recv_bytes()

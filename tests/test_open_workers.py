@@ -282,24 +282,24 @@ def test_what_was_told_stays_when_the_scheduler_goes(tmp_path):
         lost.close()
 
 
-def test_a_dask_worker_that_is_killed_costs_nothing_but_time(tmp_path):
-    three = Cluster(tmp_path / "three", workers=2)
+@pytest.mark.parametrize("number", ["SIGKILL", "SIGTERM"])  # out of the blue; by a batch system at its wall time
+def test_a_dask_worker_that_is_lost_costs_nothing_but_time(tmp_path, number):
+    two, again = Cluster(tmp_path / "two", workers=2), []
     try:
-        with open_workers("dask", scheduler=three.address) as workers:
+        with open_workers("dask", scheduler=two.address) as workers:
 
-            def kill(index, result):
-                assert result == "fine" and wait_until(lambda: working(tmp_path), 60)
-                ((parent, pid),) = working(tmp_path)
-                os.kill(parent, signal.SIGKILL)
-                assert wait_until(lambda: not running([pid]), 30)  # its child does not stay
-                (tmp_path / "end").touch()
+            def lose(index, result):
+                if index == 0:
+                    assert wait_until(lambda: working(tmp_path), 60)
+                    ((parent, pid),) = working(tmp_path)
+                    os.kill(parent, getattr(signal, number))
+                    assert wait_until(lambda: not running([pid]), 60)  # its child does not stay
+                    (tmp_path / "end").touch()
 
-            found = workers.run(
-                either, ["fine", str(tmp_path)], on_result=lambda i, result: kill(i, result) if i == 0 else None
-            )
-        assert found == ["fine", "done"] and len(working(tmp_path)) == 2
+            found = workers.run(either, ["fine", str(tmp_path)], on_result=lose, on_retry=lambda *call: again.append(1))
+        assert found == ["fine", "done"] and len(working(tmp_path)) == 2 and again == []
     finally:
-        three.close()
+        two.close()
 
 
 def test_the_lines_of_the_manual(tmp_path):
@@ -318,6 +318,25 @@ def test_the_lines_of_the_manual(tmp_path):
             assert workers.run(square, range(5)) == [0, 1, 4, 9, 16]
     finally:
         manual.close()
+
+
+UNGUARDED = """
+from finqd.workers import open_workers
+
+with open_workers(jobs=1) as workers:
+    workers.run(abs, [1])
+"""
+
+
+def test_processes_that_never_begin_are_not_the_tasks_fault(tmp_path):
+    """A script without a guard round its main part: each worker begins with workers of its own, and Python refuses."""
+    (tmp_path / "script.py").write_text(UNGUARDED)
+    found = subprocess.run([sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True)
+    assert found.returncode == 1
+    assert found.stderr.strip().splitlines()[-1] == (
+        "finqd.errors.WorkersError: the worker process ended with exit code 1 before it began, each time; "
+        'a script of your own must guard its main part with if __name__ == "__main__"'
+    )
 
 
 SCRIPT = """
