@@ -7,9 +7,13 @@ on where it was stopped, and what was evaluated before, by content, is not evalu
 
 from __future__ import annotations
 
+import json
+import socket
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,9 +22,10 @@ from finqd import archive as qd
 from finqd.design import Design
 from finqd.errors import InputError, MissingLibraryError
 from finqd.perturbations import Scheme, perturbed
-from finqd.runlog import plain
+from finqd.provenance import versions
+from finqd.runlog import plain, write_whole
 from finqd.trust import Trust, trust
-from finqd.workers import TaskFailure, Workers
+from finqd.workers import TaskFailure, Workers, open_workers
 
 if TYPE_CHECKING:
     from finqd.runlog import Run, RunLog
@@ -28,6 +33,8 @@ if TYPE_CHECKING:
 Record = Mapping[str, Any]
 Progress = Callable[[str, float], None]
 
+
+FILE = "recheck.json"
 
 #: of an evaluation, what a row has too
 RESULT = ("status", "reason", "details", "fitness", "margin", "objective", "features", "objects", "seconds", "host",
@@ -49,15 +56,59 @@ class _Task:
         return (self.design.digest(), self.record["preset"]) if isinstance(self.design, Design) else None
 
 
+def recheck(
+    folder: Path, *, count: int, scheme: Scheme | None = None, kind: str = "processes", jobs: int | None = None,
+    scheduler: str | None = None, time_limit_s: float | None = 3600.0, evaluate: Callable[..., Any] | None = None,
+    progress: Progress | None = None,
+) -> Trust:
+    """Recheck the run in a folder, see `recheck_run`; write what that says to ``recheck.json`` beside its log.
+
+    kind, jobs, scheduler: where evaluations run, see `finqd.workers.open_workers`; evaluate: as for a search
+    """
+    from finqd.runlog import RunLog, read_run
+
+    if evaluate is None:
+        from finqd.evaluate import evaluate
+    run = read_run(folder)
+    call = partial(evaluated, evaluate=evaluate, objects=run.settings["objects"])
+    with open_workers(kind, jobs=jobs, scheduler=scheduler) as workers, RunLog(folder) as log:
+        found = recheck_run(
+            run, log, count=count, scheme=scheme, workers=workers, evaluate=call, time_limit_s=time_limit_s,
+            progress=progress, where=str(folder),
+        )
+    write_whole(folder / FILE, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
+    return found
+
+
+def evaluated(
+    design: Design, *, evaluate: Callable[..., Any], objects: Any, preset: str, progress: Callable[[float], None]
+) -> dict[str, Any]:
+    """Evaluate one design, in a worker; return what a row has of it."""
+    begun = time.perf_counter()
+    fractions: dict[str, float] = {}
+
+    def move(name: str, fraction: float) -> None:
+        fractions[name] = fraction
+        progress(sum(fractions.values()) / max(len(fractions), len(objects or ())))
+
+    found = evaluate(design, objects=objects, preset=preset, jobs=1, progress=move)
+    return {
+        "fitness": found.fitness, "margin": found.margin, "features": dict(found.features),
+        "objects": found.to_dict()["objects"], "seconds": time.perf_counter() - begun, "host": socket.gethostname(),
+        "versions": dict(versions()),
+    }
+
+
 def recheck_run(
     run: Run, log: RunLog, *, count: int, workers: Workers, evaluate: Callable[..., Any], scheme: Scheme | None = None,
-    time_limit_s: float | None = 3600.0, progress: Progress | None = None,
+    time_limit_s: float | None = 3600.0, progress: Progress | None = None, where: str = "run",
 ) -> Trust:
     """Evaluate each elite of ``run`` under the first ``count`` perturbations of ``scheme``; return what that says.
 
     evaluate: called as ``evaluate(design, preset=..., progress=...)`` where a worker is, for each elite with the preset
         that it was told with; what it returns is what a search's record has of it (`finqd.search`)
     progress: called as ``progress("recheck 3 of 80", fraction)``
+    where: what sentences about the run begin with
 
     Raises InputError if there is no elite, and whatever input an evaluation finds wrong (a design that was evaluated
     before is not at fault for an object's file that is gone, or a library): nothing is written for it then.
@@ -66,7 +117,7 @@ def recheck_run(
         raise InputError(f"must be a whole number from 1 upwards, got {count!r}", where="recheck")
     scheme, elites, rows = scheme or Scheme(), run.elites(), list(run.rechecks())
     if not elites:
-        raise InputError("has no elite to recheck", where=str(run.folder))
+        raise InputError("has no elite to recheck", where=where)
     known = {(row["design_digest"], row["preset"]): row for row in rows if row["status"] in ("ok", "failed")}
     left = []
 
@@ -76,7 +127,8 @@ def recheck_run(
         rows.append(_row(task, result, scheme, run))
         log.append_recheck(rows[-1])
 
-    for task in _open_tasks(run, rows, [record for _, record in elites], count=count, scheme=scheme):
+    designs = {record["index"]: _design(run, record, where) for _, record in elites}
+    for task in _open_tasks(rows, [record for _, record in elites], designs, count=count, scheme=scheme):
         found = known.get(task.content) or _found(task, log, run)
         if found is not None:
             keep(task, found)
@@ -101,11 +153,10 @@ def trust_of(run: Run) -> Trust | None:
 
 
 def _open_tasks(
-    run: Run, rows: Sequence[Record], records: Sequence[Record], *, count: int, scheme: Scheme
+    rows: Sequence[Record], records: Sequence[Record], designs: Mapping[int, Design], *, count: int, scheme: Scheme
 ) -> list[_Task]:
     """Return what is not in the log yet, perturbation by perturbation: stopped early, all elites have about as many."""
     done = {(row["index"], row["number"]) for row in rows if row["scheme"] == scheme.to_dict()}
-    designs = {record["index"]: _design(run, record) for record in records}
     return [
         _Task(record=record, number=number, perturbation=perturbation,
               design=_under(designs[record["index"]], perturbation, record["preset"]))
@@ -115,13 +166,13 @@ def _open_tasks(
     ]
 
 
-def _design(run: Run, record: Record) -> Design:
+def _design(run: Run, record: Record, where: str) -> Design:
     """Return an elite's design. Raises InputError if it is not the one that was evaluated."""
     design = Design.from_unit_vector(np.array(record["unit"]), **run.base, name=f"evaluation {record['index']}")
     if design.digest() != record["design_digest"]:
         raise InputError(
             f"evaluation {record['index']} is another design now: the finger type or its defaults have changed since",
-            where=str(run.folder),
+            where=where,
         )
     return design
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.stats import qmc
 
 from finqd.archive import new_archive, objective
+from finqd.cli_recheck import recheck as recheck_command
 from finqd.design import Design
 from finqd.errors import InputError
 from finqd.perturbations import ADDED, RANGES, Scheme
-from finqd.recheck import recheck_run, trust_of
+from finqd.recheck import recheck, recheck_run, trust_of
 from finqd.runlog import plain
 from finqd.trust import Share
 from finqd.workers import open_workers
@@ -94,13 +97,13 @@ def run_of(count):
         })))
     assert len({cell for cell, _ in elites}) == count
     rows = []
-    return SimpleNamespace(folder="RUN", base=BASE, ranges=AXES, settings={"objects": OBJECTS}, rows=rows,
+    return SimpleNamespace(base=BASE, ranges=AXES, settings={"objects": OBJECTS}, rows=rows,
                            elites=lambda: elites, rechecks=lambda: tuple(rows), archive=lambda: archive)
 
 
 def rechecked(run, evaluate, *, count=4, room=10**9, kind="inline", **options):
     with open_workers(kind, jobs=2) as workers:
-        return recheck_run(run, Log(run, room), count=count, workers=workers, evaluate=evaluate, **options)
+        return recheck_run(run, Log(run, room), count=count, workers=workers, evaluate=evaluate, where="RUN", **options)
 
 
 def test_without_a_perturbation_the_raw_numbers_come_again_and_nothing_is_evaluated():
@@ -210,3 +213,78 @@ def test_progress_is_told():
     rechecked(run_of(2), steady, count=2, progress=lambda text, fraction: seen.append((text, fraction)))
     assert [text for text, _ in seen] == ["recheck 2 of 4", "recheck 3 of 4", "recheck 4 of 4", "recheck 4 of 4"]
     assert [fraction for _, fraction in seen] == [0.25, 0.5, 0.75, 1.0]
+
+
+# a run's folder, and the command --------------------------------------------------------------------------------------
+
+
+class Found:
+    """What evaluations return, see `finqd.evaluate.Evaluation`."""
+
+    def __init__(self, design, preset):
+        result = steady(design, preset=preset)
+        self.fitness, self.margin, self.features = result["fitness"], result["margin"], result["features"]
+        self.objects = result["objects"]
+
+    def to_dict(self):
+        return {"objects": self.objects}
+
+
+def evaluate(design, *, objects, preset, jobs, progress):
+    assert objects == OBJECTS and jobs == 1
+    for name in objects:
+        progress(name, 1.0)
+    return Found(design, preset)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder that the run's log says is a run of two elites."""
+    run = run_of(2)
+
+    class OpenLog(Log):
+        def __init__(self, path):
+            assert path == tmp_path
+            super().__init__(run)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    monkeypatch.setattr("finqd.runlog.read_run", lambda path: run, raising=False)
+    monkeypatch.setattr("finqd.runlog.RunLog", OpenLog)
+    return tmp_path
+
+
+def test_a_folder_is_rechecked_and_what_it_says_is_beside_its_log(folder):
+    seen = []
+    found = recheck(folder, count=3, kind="inline", evaluate=evaluate, progress=lambda *call: seen.append(call))
+    assert json.loads((folder / "recheck.json").read_text()) == json.loads(json.dumps(found.to_dict()))
+    assert found.complete and found.corrected == found.raw and seen[-1] == ("recheck 6 of 6", 1.0)
+
+
+def test_the_command_says_what_came_of_it(folder, monkeypatch):
+    monkeypatch.setattr("finqd.evaluate.evaluate", evaluate)
+    options = ["-k", "2", "--workers", "inline", "--vary", "mesh_size=off"]
+    done = CliRunner().invoke(recheck_command, [str(folder), *options])
+    assert done.exit_code == 0, done.output
+    assert "QD score: " in done.output and "coverage: 0.0013 as searched, 0.0013 corrected" in done.output
+    assert "sphere" in done.output and "2 of 2" in done.output
+    assert "mesh_size" not in json.loads((folder / "recheck.json").read_text())["scheme"]["ranges"]
+
+
+@pytest.mark.parametrize(
+    ("vary", "sentence"),
+    [
+        ("friction", "--vary: must be NAME=LOW:HIGH or NAME=off, as in friction=0.9:1.1, not 'friction'"),
+        ("friction=1:2:3", "--vary: must be NAME=LOW:HIGH or NAME=off, as in friction=0.9:1.1, not 'friction=1:2:3'"),
+        ("mu=1:2", "ranges.mu: nothing of this name is varied; known: friction, offset_x_mm, offset_y_mm, turn_deg, "
+         "stiffness, time_step, mesh_size"),
+    ],
+)
+def test_what_cannot_be_varied_gets_one_sentence(folder, vary, sentence):
+    done = CliRunner().invoke(recheck_command, [str(folder), "--vary", vary])
+    assert isinstance(done.exception, InputError) and str(done.exception) == sentence
+    assert not (folder / "recheck.json").exists()
