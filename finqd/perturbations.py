@@ -76,29 +76,33 @@ class Scheme:
                 told = f"{given[0]:g} to {given[1]:g}"
                 raise InputError(f"must be a low and a high number within {low:g} to {high:g}, not {told}",
                                  where=f"ranges.{name}")
-        chosen = {**RANGES, **self.ranges}
-        object.__setattr__(self, "ranges", {name: one for name, one in chosen.items() if one is not None})
+
+    @property
+    def varied(self) -> dict[str, tuple[float, float]]:
+        """The range of each quantity that is varied."""
+        return {name: one for name, one in {**RANGES, **self.ranges}.items() if one is not None}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scheme as the log holds it."""
-        laws = {name: "normal" if name in NORMAL else "uniform" for name in self.ranges}
+        laws = {name: "normal" if name in NORMAL else "uniform" for name in self.varied}
         return {
             "sampler": "scrambled Sobol; normal: two standard deviations from the middle to each end, truncated there",
             "seed": self.seed,
-            "ranges": {name: [*map(float, one), laws[name]] for name, one in self.ranges.items()},
+            "ranges": {name: [*map(float, one), laws[name]] for name, one in self.varied.items()},
         }
 
     def draw(self, count: int) -> list[dict[str, float]]:
         """Return the first ``count`` perturbations, name -> factor or what is added."""
         from scipy.stats import qmc
 
-        if not self.ranges:
+        varied = self.varied
+        if not varied:
             return [{} for _ in range(count)]
         # all quantities have their dimension, varied or not: leaving one out does not change the others
         sampler = qmc.Sobol(len(RANGES), scramble=True, seed=np.random.default_rng(self.seed))
         points = sampler.random_base2(max(count - 1, 0).bit_length())[:count]
         return [
-            {name: _value(name, self.ranges[name], u) for name, u in zip(RANGES, point) if name in self.ranges}
+            {name: _value(name, varied[name], u) for name, u in zip(RANGES, point) if name in varied}
             for point in points.tolist()
         ]
 

@@ -160,7 +160,7 @@ def trust(
         best[cell] = max(value, best.get(cell, value))
     return Trust(
         scheme=scheme, rechecks=count, complete=all(one.rechecks == count for one in told), cells=int(archive.cells),
-        raw=_scores(rechecked, archive.cells), corrected=_scores(best.values(), archive.cells),
+        raw=_scores(rechecked, int(archive.cells)), corrected=_scores(best.values(), int(archive.cells)),
         elites=told, objects=_pooled(told),
     )
 
