@@ -53,6 +53,7 @@ class Processes:
             raise InputError(f"must be a whole number from 1 upwards, got {jobs!r}", where="jobs")
         self.jobs = jobs
         self._workers: list[_Worker] = []
+        self._proven = False  # one has begun: processes work here
 
     def run(
         self, function: Callable[..., Any], tasks: Sequence[Any], *, time_limit_s: float | None = None,
@@ -62,7 +63,7 @@ class Processes:
         """Return the result of each task, see `finqd.workers.Workers`.
 
         on_tick: called about once a second while tasks run; what it raises ends them
-        Raises WorkersError if processes die before they begin: no task is at fault then
+        Raises WorkersError if not one process lives long enough to begin: no task is at fault then
         """
         check_limits(time_limit_s=time_limit_s, retries=retries)
         board = Board.of(tasks, retries=retries, on_result=on_result, on_progress=on_progress, on_retry=on_retry)
@@ -75,12 +76,13 @@ class Processes:
                 for worker in _ready(self._workers, on_tick):
                     index, payload = worker.index, worker.payload
                     crash = _serve(worker, board, time_limit_s)
+                    self._proven = self._proven or worker.began
                     if crash is not None:
                         self._end([worker])
                         assert index is not None  # only busy workers are asked
                         if crash.kind != "crash":
                             board.put(index, crash)
-                        elif not worker.began and 0 < retries < board.attempts[index]:
+                        elif not self._proven and 0 < retries < board.attempts[index]:
                             raise WorkersError(f"{crash.reason} before it began, each time; {GUARD}")
                         elif board.again(index, crash):
                             waiting.append((index, payload))
