@@ -118,7 +118,7 @@ def recheck_run(
     scheme, elites, rows = scheme or Scheme(), run.elites(), list(run.rechecks())
     if not elites:
         raise InputError("has no elite to recheck", where=where)
-    known = {(row["design_digest"], row["preset"]): row for row in rows if row["status"] in ("ok", "failed")}
+    known = {(row["design_digest"], row["preset"]): row for row in rows if _repeats(row)}
     left = []
 
     def keep(task: _Task, result: Any) -> None:
@@ -175,6 +175,12 @@ def _design(run: Run, record: Record, where: str) -> Design:
             where=where,
         )
     return design
+
+
+def _repeats(row: Record) -> bool:
+    """Return whether the same would come of the same content: not after a crash or a time limit, or in another version."""
+    made_with = row["versions"] or {}
+    return row["status"] in ("ok", "failed") and all(made_with.get(name) == one for name, one in versions().items())
 
 
 def _under(design: Design, perturbation: Mapping[str, float], preset: str) -> Design | TaskFailure:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
+import sqlite3
 from functools import partial
 from types import SimpleNamespace
 
@@ -14,11 +16,12 @@ from scipy.stats import qmc
 
 from finqd.archive import new_archive, objective
 from finqd.cli_recheck import recheck as recheck_command
-from finqd.design import Design
+from finqd.design import Design, design_parameters
 from finqd.errors import InputError
 from finqd.perturbations import ADDED, RANGES, Scheme
+from finqd.provenance import versions
 from finqd.recheck import recheck, recheck_run, trust_of
-from finqd.runlog import plain
+from finqd.runlog import RunLog, plain, read_run
 from finqd.trust import Share
 from finqd.workers import open_workers
 
@@ -238,24 +241,16 @@ def evaluate(design, *, objects, preset, jobs, progress):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder that the run's log says is a run of two elites."""
-    run = run_of(2)
-
-    class OpenLog(Log):
-        def __init__(self, path):
-            assert path == tmp_path
-            super().__init__(run)
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
-    monkeypatch.setattr("finqd.runlog.read_run", lambda path: run, raising=False)
-    monkeypatch.setattr("finqd.runlog.RunLog", OpenLog)
-    return tmp_path
+def folder(tmp_path):
+    """A run of two elites on disk."""
+    settings = {"objects": OBJECTS, "cells": 40, "preset": "draft"}
+    with RunLog.start(
+        tmp_path / "run", settings=settings, base=BASE, parameters=design_parameters(), ranges=AXES
+    ) as log:
+        for number, (_, record) in enumerate(run_of(2).elites()):
+            log.append({**record, "index": number, "versions": versions()})
+        log.note_told(2)
+    return tmp_path / "run"
 
 
 def test_a_folder_is_rechecked_and_what_it_says_is_beside_its_log(folder):
@@ -263,6 +258,26 @@ def test_a_folder_is_rechecked_and_what_it_says_is_beside_its_log(folder):
     found = recheck(folder, count=3, kind="inline", evaluate=evaluate, progress=lambda *call: seen.append(call))
     assert json.loads((folder / "recheck.json").read_text()) == json.loads(json.dumps(found.to_dict()))
     assert found.complete and found.corrected == found.raw and seen[-1] == ("recheck 6 of 6", 1.0)
+
+
+def test_a_folder_that_is_stopped_goes_on_to_the_same_rows(folder, tmp_path):
+    expected = recheck(folder, count=3, kind="inline", evaluate=evaluate)
+    whole = read_run(folder).rechecks()
+    again = tmp_path / "again"
+    shutil.copytree(folder, again)
+    with sqlite3.connect(again / "run.sqlite") as connection:
+        connection.execute("DELETE FROM rechecks WHERE id > 2")
+    connection.close()
+    assert not trust_of(read_run(again)).complete or len(read_run(again).rechecks()) == 2
+    assert recheck(again, count=3, kind="processes", evaluate=evaluate).to_dict() == expected.to_dict()
+    timeless = [[{**row, "seconds": 0} for row in sorted(rows, key=lambda row: (row["number"], row["index"]))]
+                for rows in (whole, read_run(again).rechecks())]
+    assert timeless[0] == timeless[1] and len(whole) == 6
+
+
+def test_nominal_conditions_are_found_in_the_log_of_the_search(folder):
+    found = recheck(folder, count=2, kind="inline", evaluate=None, scheme=Scheme(ranges=NOTHING))
+    assert found.complete and found.corrected == found.raw and len(read_run(folder).rechecks()) == 4
 
 
 def test_the_command_says_what_came_of_it(folder, monkeypatch):
