@@ -23,7 +23,7 @@ from finqd.design import Design
 from finqd.errors import InputError, MissingLibraryError
 from finqd.perturbations import Scheme, perturbed
 from finqd.provenance import versions
-from finqd.runlog import plain, write_whole
+from finqd.run_folder import plain, write_whole
 from finqd.trust import Trust, trust
 from finqd.workers import TaskFailure, Workers, open_workers
 
@@ -178,7 +178,7 @@ def _design(run: Run, record: Record, where: str) -> Design:
 
 
 def _repeats(row: Record) -> bool:
-    """Return whether the same would come of the same content: not after a crash or a time limit, or in another version."""
+    """Return whether the same would come again of the same content: not for sure after a crash or a time limit."""
     made_with = row["versions"] or {}
     return row["status"] in ("ok", "failed") and all(made_with.get(name) == one for name, one in versions().items())
 
