@@ -107,7 +107,7 @@ def recheck_run(
 
     evaluate: called as ``evaluate(design, preset=..., progress=...)`` where a worker is, for each elite with the preset
         that it was told with; what it returns is what a search's record has of it (`finqd.search`)
-    progress: called as ``progress("recheck 3 of 80", fraction)``
+    progress: called as ``progress("80 rechecks", fraction)``
     where: what sentences about the run begin with
 
     Raises InputError if there is no elite, and whatever input an evaluation finds wrong (a design that was evaluated
@@ -199,17 +199,15 @@ def _evaluate_all(
     tasks: Sequence[_Task], keep: Callable[[_Task, Any], None], *, workers: Workers, evaluate: Callable[..., Any],
     time_limit_s: float | None, progress: Progress | None,
 ) -> None:
-    fractions, finished = np.zeros(len(tasks)), 0
+    fractions = np.zeros(len(tasks))
 
     def move(index: int, fraction: float) -> None:
         fractions[index] = fraction
         if progress is not None:
-            progress(f"recheck {min(finished + 1, len(tasks))} of {len(tasks)}", float(fractions.mean()))
+            progress(f"{len(tasks)} rechecks", float(fractions.mean()))
 
     def take(index: int, result: Any) -> None:
-        nonlocal finished
         keep(tasks[index], result)
-        finished += 1
         move(index, 1.0)
 
     workers.run(
