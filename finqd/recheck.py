@@ -8,8 +8,6 @@ on where it was stopped, and what was evaluated before, by content, is not evalu
 from __future__ import annotations
 
 import json
-import socket
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -66,6 +64,7 @@ def recheck(
     kind, jobs, scheduler: where evaluations run, see `finqd.workers.open_workers`; evaluate: as for a search
     """
     from finqd.runlog import RunLog, read_run
+    from finqd.search_evaluate import evaluated
 
     if evaluate is None:
         from finqd.evaluate import evaluate
@@ -73,40 +72,21 @@ def recheck(
     call = partial(evaluated, evaluate=evaluate, objects=run.settings["objects"])
     with open_workers(kind, jobs=jobs, scheduler=scheduler) as workers, RunLog(folder) as log:
         found = recheck_run(
-            run, log, count=count, scheme=scheme, workers=workers, evaluate=call, time_limit_s=time_limit_s,
+            run, log, count=count, scheme=scheme, workers=workers, call=call, time_limit_s=time_limit_s,
             progress=progress, where=str(folder),
         )
     write_whole(folder / FILE, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
     return found
 
 
-def evaluated(
-    design: Design, *, evaluate: Callable[..., Any], objects: Any, preset: str, progress: Callable[[float], None]
-) -> dict[str, Any]:
-    """Evaluate one design, in a worker; return what a row has of it."""
-    begun = time.perf_counter()
-    fractions: dict[str, float] = {}
-
-    def move(name: str, fraction: float) -> None:
-        fractions[name] = fraction
-        progress(sum(fractions.values()) / max(len(fractions), len(objects or ())))
-
-    found = evaluate(design, objects=objects, preset=preset, jobs=1, progress=move)
-    return {
-        "fitness": found.fitness, "margin": found.margin, "features": dict(found.features),
-        "objects": found.to_dict()["objects"], "seconds": time.perf_counter() - begun, "host": socket.gethostname(),
-        "versions": dict(versions()),
-    }
-
-
 def recheck_run(
-    run: Run, log: RunLog, *, count: int, workers: Workers, evaluate: Callable[..., Any], scheme: Scheme | None = None,
+    run: Run, log: RunLog, *, count: int, workers: Workers, call: Callable[..., Any], scheme: Scheme | None = None,
     time_limit_s: float | None = 3600.0, progress: Progress | None = None, where: str = "run",
 ) -> Trust:
     """Evaluate each elite of ``run`` under the first ``count`` perturbations of ``scheme``; return what that says.
 
-    evaluate: called as ``evaluate(design, preset=..., progress=...)`` where a worker is, for each elite with the preset
-        that it was told with; what it returns is what a search's record has of it (`finqd.search`)
+    call: evaluates a design with a preset where a worker is, as `finqd.search_evaluate.evaluated` does; the preset is
+        the one that an elite was told with
     progress: called as ``progress("80 rechecks", fraction)``
     where: what sentences about the run begin with
 
@@ -136,7 +116,7 @@ def recheck_run(
             keep(task, task.design)
         else:
             left.append(task)
-    _evaluate_all(left, keep, workers=workers, evaluate=evaluate, time_limit_s=time_limit_s, progress=progress)
+    _evaluate_all(left, keep, workers=workers, call=call, time_limit_s=time_limit_s, progress=progress)
     return trust(
         elites, rows, archive=run.archive(), features=tuple(run.ranges), scheme=scheme.to_dict(), count=count
     )
@@ -196,7 +176,7 @@ def _found(task: _Task, log: RunLog, run: Run) -> Record | None:
 
 
 def _evaluate_all(
-    tasks: Sequence[_Task], keep: Callable[[_Task, Any], None], *, workers: Workers, evaluate: Callable[..., Any],
+    tasks: Sequence[_Task], keep: Callable[[_Task, Any], None], *, workers: Workers, call: Callable[..., Any],
     time_limit_s: float | None, progress: Progress | None,
 ) -> None:
     fractions = np.zeros(len(tasks))
@@ -211,14 +191,9 @@ def _evaluate_all(
         move(index, 1.0)
 
     workers.run(
-        partial(_evaluated, evaluate=evaluate), [(task.design, task.record["preset"]) for task in tasks],
-        time_limit_s=time_limit_s, on_result=take, on_progress=move,
+        call, [(task.design, task.record["preset"]) for task in tasks], time_limit_s=time_limit_s, on_result=take,
+        on_progress=move,
     )
-
-
-def _evaluated(task: tuple[Design, str], *, evaluate: Callable[..., Any], progress: Callable[[float], None]) -> Any:
-    design, preset = task
-    return evaluate(design, preset=preset, progress=progress)
 
 
 def _row(task: _Task, result: Any, scheme: Scheme, run: Run) -> dict[str, Any]:
@@ -228,6 +203,7 @@ def _row(task: _Task, result: Any, scheme: Scheme, run: Run) -> dict[str, Any]:
         "scheme": scheme.to_dict(), "preset": task.record["preset"],
         "design_digest": task.content[0] if task.content else None,
         **dict.fromkeys(RESULT), "objective": qd.PENALTY, "features": {}, "objects": {}, "attempts": 1,
+        "versions": dict(versions()),
     }
     if isinstance(result, TaskFailure):
         return {**row, "status": result.kind, "reason": result.reason, "details": result.details,

@@ -42,32 +42,35 @@ def features_of(design):
     return {"workspace_mm2": design.workspace * 1e6, "volume_mm3": 500.0 * sum(f["length_mm"] for f in design.fingers)}
 
 
-def steady(design, *, preset, progress=None):
+def steady(task, *, progress=None):
     """A stand-in that holds the same objects under all conditions."""
+    design, _ = task
     number = round(100 * design.spacing_mm)
     return result_of([number % 2, number % 3 > 0, 1], features_of(design))
 
 
-def flipping(design, *, preset, progress=None, rate=0.3):
+def flipping(task, *, progress=None, rate=0.3):
     """A stand-in each of whose verdicts differs with a known probability from that under nominal conditions."""
+    design, _ = task
     bits = np.random.default_rng(int(hashlib.sha256(design.digest().encode()).hexdigest()[:12], 16)).random(3)
-    raw = [one["held"] for one in steady(design, preset=preset)["objects"].values()]
+    raw = [one["held"] for one in steady(task)["objects"].values()]
     return result_of([bool(one) ^ bool(bit < rate) for one, bit in zip(raw, bits)], features_of(design))
 
 
-def must_not_run(design, *, preset, progress=None):
+def must_not_run(task, *, progress=None):
     raise AssertionError("it was evaluated before")
 
 
-def object_gone(design, *, preset, progress=None):
+def object_gone(task, *, progress=None):
     raise InputError("there is no such file", where="part.stl")
 
 
-def fragile(design, *, preset, progress=None):
+def fragile(task, *, progress=None):
     """A stand-in that fails with less friction."""
+    design, _ = task
     if design.protocol.friction_coefficient < 0.6:
         raise ValueError("does not converge")
-    return steady(design, preset=preset)
+    return steady(task)
 
 
 class Log:
@@ -93,7 +96,7 @@ def run_of(count):
     elites = []
     for i, unit in enumerate(qmc.Sobol(28, scramble=True, seed=0).random(8)[:count]):
         design = Design.from_unit_vector(unit, **BASE)
-        result = steady(design, preset="draft")
+        result = steady((design, "draft"))
         (cell,) = archive.int_to_grid_index([archive.index_of_single(list(result["features"].values()))]).tolist()
         elites.append((tuple(cell), plain({
             **result, "index": 3 * i, "unit": unit, "preset": "draft", "status": "ok", "reason": "",
@@ -107,7 +110,7 @@ def run_of(count):
 
 def rechecked(run, evaluate, *, count=4, room=10**9, kind="inline", **options):
     with open_workers(kind, jobs=2) as workers:
-        return recheck_run(run, Log(run, room), count=count, workers=workers, evaluate=evaluate, where="RUN", **options)
+        return recheck_run(run, Log(run, room), count=count, workers=workers, call=evaluate, where="RUN", **options)
 
 
 def test_without_a_perturbation_the_raw_numbers_come_again_and_nothing_is_evaluated():
@@ -225,7 +228,7 @@ class Found:
     """What evaluations return, see `finqd.evaluate.Evaluation`."""
 
     def __init__(self, design, preset):
-        result = steady(design, preset=preset)
+        result = steady((design, preset))
         self.fitness, self.margin, self.features = result["fitness"], result["margin"], result["features"]
         self.objects = result["objects"]
 
