@@ -104,7 +104,7 @@ def run_to_first_step(preset: str, begun: float) -> dict[str, Any]:
     step = design.protocol.time_step_ms * MS
     with compile_clock() as compiled, slowest_kernels() as slowest:
         scene = grasp_scene(task)
-        assert overlap_at_start(scene, grasped) is None
+        assert overlap_at_start(scene, grasped, design.protocol) is None
         simulate(scene, duration=step, time_step=step, stepper=Announced(stepper, clock), contact=contact)
         clock.lap("first step")
         kernels = compiled()

@@ -33,6 +33,6 @@ ASSUMPTIONS = (
     "where fingers touch, sharp edges of objects count as rounded (contact.edge_radius_mm; less, or not, on fine ones)",
     "the mount is rigid: each finger base is driven as a whole",
     "each finger's drive stalls by itself when the sum of the normal contact forces on that finger reaches its limit",
-    "the object starts at rest on the floor, centred under the gripper",
+    "the object starts at rest on the floor, centred under the gripper unless the protocol moves or turns it",
     "held: dropped less than the threshold relative to the gripper from the start of the lift to the end of the hold",
 )

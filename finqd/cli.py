@@ -18,6 +18,7 @@ import click
 
 from finqd import __version__
 from finqd.cli_accuracy import accuracy
+from finqd.cli_recheck import recheck
 from finqd.cli_verify import verify
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, InputError
@@ -259,6 +260,7 @@ def doctor() -> int:
 
 
 finqd.add_command(accuracy)
+finqd.add_command(recheck)
 finqd.add_command(verify)
 
 

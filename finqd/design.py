@@ -48,7 +48,7 @@ from finqd.effects import refuse_contradictions
 from finqd.errors import InputError
 from finqd.json_input import read_json_object
 from finqd.mechanics.material import Material
-from finqd.protocol import GraspProtocol
+from finqd.protocol import LATER, GraspProtocol
 from finqd.units import si_factor
 
 __all__ = ["Design", "GraspProtocol", "design_parameters", "parse_setting"]
@@ -114,6 +114,7 @@ class Design:
     def digest(self) -> str:
         """Return a hash (SHA-256, hex) of all that is simulated: of `resolved`, without name and description."""
         content = {key: value for key, value in self.resolved().items() if key not in TEXTS}
+        content["protocol"] = {key: value for key, value in content["protocol"].items() if value or key not in LATER}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @staticmethod

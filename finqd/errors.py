@@ -5,6 +5,7 @@
     |   +-- PluginError       a plugin is unknown, registered twice, does not import or refuses its options
     +-- MissingLibraryError   a library of this machine is missing; the sentence names what to install
     +-- MeshError             a solid could not be meshed (in time)
+    +-- WorkersError          the workers that evaluations run on are gone, or are not fit for them
 
 A simulation that fails is none of these: it is data, a status and a reason in the result. A ``MeshError`` becomes such
 a result too as soon as `finqd.evaluate` sees it.
@@ -45,3 +46,7 @@ class MissingLibraryError(FinqdError):
 
 class MeshError(FinqdError):
     """Meshing failed or ran out of time: the design's failure, recorded as data."""
+
+
+class WorkersError(FinqdError):
+    """The workers that evaluations run on cannot be reached, are gone, or run another finqd than this one."""

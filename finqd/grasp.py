@@ -97,7 +97,7 @@ def grasp_scene(task: GraspTask) -> Scene:
     off = {name for name, state in design.forced_effects.items() if state == "off"}
     if "floor" not in off:
         scene.add_plane(name=FLOOR)
-    _add_object(scene, replace(task.grasped, soft=None) if "soft_object" in off else task.grasped)
+    _add_object(scene, replace(task.grasped, soft=None) if "soft_object" in off else task.grasped, protocol)
     _leave_out(scene, off, fingers=_named(scene, task, "finger"), grasped=task.grasped.name)
     for pair, key in FRICTION.items():
         if "floor" in off and FLOOR in pair:
@@ -110,12 +110,13 @@ def grasp_scene(task: GraspTask) -> Scene:
     return scene
 
 
-def _add_object(scene: Scene, grasped: GraspObject) -> None:
+def _add_object(scene: Scene, grasped: GraspObject, protocol: GraspProtocol) -> None:
+    pose = object_pose(grasped, protocol)
     if grasped.soft is None or grasped.mesh is None:
-        scene.add_rigid(grasped, position=(0.0, 0.0, grasped.rest_height), rotation=grasped.rest_rotation)
+        scene.add_rigid(grasped, position=tuple(pose[:3, 3].tolist()), rotation=pose[:3, :3].copy())
         return
     material = grasped.soft.material(grasped.mass / grasped.mesh.volume)
-    body = grasped.mesh.transformed(object_pose(grasped))
+    body = grasped.mesh.transformed(pose)
     scene.add_soft(body, material, elasticity=grasped.soft.elasticity, name=grasped.name)
 
 
@@ -130,10 +131,15 @@ def _leave_out(scene: Scene, off: set[str], *, fingers: Sequence[str], grasped: 
             scene.ignore(other, finger)
 
 
-def object_pose(grasped: GraspObject) -> np.ndarray:
+def object_pose(grasped: GraspObject, protocol: GraspProtocol) -> np.ndarray:
     """Return the (4, 4) matrix from an object's body frame to where it rests on the floor under the gripper."""
     pose = np.eye(4)
-    pose[:3, :3], pose[2, 3] = grasped.rest_rotation, grasped.rest_height
+    pose[:3, :3] = grasped.rest_rotation
+    pose[:3, 3] = protocol.si("object_offset_x_mm"), protocol.si("object_offset_y_mm"), grasped.rest_height
+    if protocol.object_turn_deg:  # not even the sign of a zero changes without a turn
+        angle = protocol.si("object_turn_deg")
+        cosine, sine = math.cos(angle), math.sin(angle)
+        pose[:2, :3] = np.array([[cosine, -sine], [sine, cosine]]) @ pose[:2, :3]
     return pose
 
 
@@ -143,13 +149,13 @@ def _named(scene: Scene, task: GraspTask, what: str) -> list[str]:
     return {"finger": fingers, "object": [task.grasped.name], "floor": [FLOOR]}[what]
 
 
-def overlap_at_start(scene: Scene, grasped: GraspObject) -> str | None:
+def overlap_at_start(scene: Scene, grasped: GraspObject, protocol: GraspProtocol) -> str | None:
     """Return a sentence if fingers overlap each other or the object at the start, else None."""
     from finqd.collision import overlaps
 
     fingers = [body for body in scene.soft_bodies if body.name != grasped.name]
     surfaces = [(finger.mesh.vertices, finger.mesh.surface_triangles(), np.eye(4)) for finger in fingers]
-    thing = (grasped.vertices, grasped.triangles, object_pose(grasped))
+    thing = (grasped.vertices, grasped.triangles, object_pose(grasped, protocol))
     for i, (finger, surface) in enumerate(zip(fingers, surfaces, strict=True)):
         for other, beside in zip(fingers[:i], surfaces, strict=False):
             if overlaps(beside, surface):
@@ -193,7 +199,7 @@ def _simulated(
     design = with_effects(task.design)
     protocol = design.protocol
     scene = grasp_scene(task)
-    overlap = overlap_at_start(scene, task.grasped)
+    overlap = overlap_at_start(scene, task.grasped, protocol)
     if overlap is not None:
         return Trajectory(status="no_room", reason=overlap, object_name=task.grasped.name, protocol=protocol)
     trajectory = simulate(

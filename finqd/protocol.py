@@ -14,6 +14,10 @@ from annotated_types import Ge, Gt, Le
 from finqd.units import si_factor
 
 Friction = Annotated[float, Ge(0), Le(5)] | None
+Offset = Annotated[float, Ge(-100), Le(100)]
+
+#: constants that came when digests of designs were in use already; at their defaults they are not part of them
+LATER = ("object_offset_x_mm", "object_offset_y_mm", "object_turn_deg")
 
 
 def _constant(default: float | None, description: str) -> Any:
@@ -37,6 +41,11 @@ class GraspProtocol:
     friction_object_floor: Friction = _constant(None, "mu of object and floor, if it is another")
     tip_clearance_mm: Annotated[float, Ge(0), Le(200)] = _constant(
         3.0, "gap between the longest finger's tip and the floor at the start"
+    )
+    object_offset_x_mm: Offset = _constant(0.0, "how far the object lies off the gripper's axis, to the first finger")
+    object_offset_y_mm: Offset = _constant(0.0, "how far it lies off the axis across that")
+    object_turn_deg: Annotated[float, Ge(-360), Le(360)] = _constant(
+        0.0, "how far the object is turned about the vertical, seen from above against the clock"
     )
     settle_s: Annotated[float, Ge(0), Le(60)] = _constant(0.0, "the object settles on the floor before fingers close")
     close_s: Annotated[float, Gt(0), Le(60)] = _constant(1.0, "time the actuator is given for its stroke")
