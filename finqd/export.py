@@ -39,10 +39,9 @@ def export_gripper(design: Design, out: str | os.PathLike[str]) -> list[Path]:
     paths = _targets(Path(out))
     geometry = design.plugin("geometry")
     solids = [geometry.build(design.finger_si(i)) for i in range(FINGERS)]
-    plate = next((f.plate_mm for f in design.plugin("features") if hasattr(f, "plate_mm")), _PLATE_MM)
     with gmsh_session() as gmsh:
         try:
-            _join(gmsh, _parts(gmsh, solids, design.spacing, plate * si_factor("plate_mm")))
+            _join(gmsh, _parts(gmsh, solids, design.spacing, _plate(design)))
             for path in paths:
                 _write(gmsh, path)
         except FinqdError:
@@ -50,6 +49,35 @@ def export_gripper(design: Design, out: str | os.PathLike[str]) -> list[Path]:
         except Exception as error:  # gmsh raises bare exceptions
             raise FinqdError(f"the gripper could not be exported: {' '.join(str(error).split())}") from error
     return paths
+
+
+def gripper_parts(design: Design) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return the closed surfaces that the export joins, as name, vertices (n, 3) [m] and outward triangles (m, 3).
+
+    They touch along whole faces, and pads and plate overlap. Raises ``InputError`` for inconsistent values.
+    """
+    geometry, plate = design.plugin("geometry"), _plate(design)
+    solids = [geometry.build(design.finger_si(i)) for i in range(FINGERS)]
+    ring = mount_plate(design.spacing)
+    parts = [("mount", *_raised(Prism(ring, (), plate).surface(), 0.5 * plate))]
+    for i, solid in enumerate(solids):
+        matrix = placement(i, FINGERS, design.spacing)
+        low, high = pad(solid, design.spacing)
+        corners = np.array([[low[0], -plate], [high[0], -plate], [high[0], 0.0], [low[0], 0.0]])
+        cushion = Prism(corners, (), high[1] - low[1]).surface()
+        for name, surface in (("finger", solid.surface()), ("mount", _raised(cushion, 0.5 * (low[1] + high[1])))):
+            parts.append((name, surface[0] @ matrix[:3, :3].T + matrix[:3, 3], surface[1]))
+    return parts
+
+
+def _raised(surface: tuple[np.ndarray, np.ndarray], height: float) -> tuple[np.ndarray, np.ndarray]:
+    return surface[0] + np.array([0.0, 0.0, height]), surface[1]
+
+
+def _plate(design: Design) -> float:
+    """Return the thickness of the mount's plate [m]."""
+    plate = next((f.plate_mm for f in design.plugin("features") if hasattr(f, "plate_mm")), _PLATE_MM)
+    return plate * si_factor("plate_mm")
 
 
 def mount_plate(spacing: float) -> np.ndarray:
