@@ -211,7 +211,7 @@ function markOnPareto(root, x, y, box) {
   if (!b || !Number.isFinite(b.features[key])) return;
   const at = x(b.features[key]), known = Number.isFinite(b.fitness), right = at > (box.left + box.right) / 2;
   root.append(svg("line", { x1: at, x2: at, y1: box.top, y2: box.bottom, class: "benchmark-line" }),
-    svg("text", { x: at + (right ? -6 : 6), y: box.bottom - 8, "text-anchor": right ? "end" : "start", class: "value-text benchmark-text" }, known ? b.name : `${b.name} (fitness not known)`));
+    svg("text", { x: at + (right ? -6 : 6), y: box.bottom - 8, "text-anchor": right ? "end" : "start", class: "value-text benchmark-text" }, known ? b.name : `${b.name}, not evaluated`));
   if (known) root.append(svg("path", { d: `M${at},${y(b.fitness) - 7}l7,7l-7,7l-7,-7z`, class: "benchmark-mark" }, svg("title", {}, `${b.name}: fitness ${number(b.fitness)}`)));
 }
 
@@ -283,8 +283,9 @@ function brushable(axis, k, box, scale) {
     const move = (m) => { const ys = [from, valueAt(m)].map(scale).sort((a, b) => a - b); mark.setAttribute("y", ys[0]); mark.setAttribute("height", ys[1] - ys[0]); };
     area.addEventListener("pointermove", move);
     area.addEventListener("pointerup", (u) => {
-      const [low, high] = [from, valueAt(u)].sort((a, b) => a - b).map((v) => Number(Math.max(axis.low, Math.min(axis.high, v)).toPrecision(4)));
-      setLimit(axis.key, high - low < 0.015 * (axis.high - axis.low) ? null : [low, high]);
+      const [low, high] = [from, valueAt(u)].sort((a, b) => a - b), near = 0.025 * (axis.high - axis.low);
+      const end = (value, limit) => (Math.abs(value - limit) < near || (value - limit) * (axis.high + axis.low - 2 * limit) < 0 ? null : Number(value.toPrecision(4)));
+      setLimit(axis.key, high - low < 0.6 * near ? null : [end(low, axis.low), end(high, axis.high)]); // up to an end: no limit there
     }, { once: true });
   });
   return area;
