@@ -24,7 +24,7 @@ NEIGHBOURS = 5
 @click.option("--benchmark", type=click.Path(path_type=Path), metavar="FILE.json",
               help="Compare with this result, from `finqd evaluate DESIGN --out FILE.json`.  "
                    f"[default: RUN/{BENCHMARK} if it is there]")
-@click.option("--shapes", type=click.IntRange(0), default=400, show_default=True,
+@click.option("--shapes", type=click.IntRange(0), default=300, show_default=True,
               help="Designs that can be seen in 3-D at most, the best first.")
 def report(run: Path, out: Path | None, png: Path | None, benchmark: Path | None, shapes: int) -> None:
     """Show what a search found: one HTML page, without network, from which to pick a gripper.

@@ -48,17 +48,18 @@ def write_report(
 
     with written_at_end(out, "--out") as write:
         data = report_data(run, name=name, argument=argument, benchmark=benchmark)
-        write(page(data, shapes_of(designs_shown(run, data), limit=shapes)))
+        write(page(data, shapes_of(designs_shown(data), limit=shapes)))
 
 
 def report_data(run: Any, *, name: str, argument: str = "RUN", benchmark: Path | None = None) -> dict[str, Any]:
     """Return all that the page shows but the shapes: plain values, as JSON holds them, in the units of their keys."""
-    records, elites, archive = run.records(), run.elites(), run.archive()
+    records, archive = run.records(), run.archive()
+    elites = qd.elites(archive, records)
     objects = _objects(records)
     axes = _axes(run.ranges, archive.dims)
     volume = shown_volume(records, run.ranges)
     front = pareto_front([r for r in records if r["status"] == "ok"], volume)
-    shown = _shown(archive, records, elites, front, run.ranges)
+    shown = _shown(archive, elites, front, run.ranges)
     designs = [_design_entry(run, record, cell, is_elite) for record, cell, is_elite in shown]
     compared = benchmark_of(run, benchmark, objects, archive)
     return plain({
@@ -84,11 +85,10 @@ def design_of(run: Any, record: Mapping[str, Any]) -> Design:
     return Design.from_unit_vector(record["unit"], **base, name=name)
 
 
-def designs_shown(run: Any, data: Mapping[str, Any]) -> list[tuple[int, Any]]:
+def designs_shown(data: Mapping[str, Any]) -> list[tuple[int, Any]]:
     """Return index and a function that makes the design of each one on the page, the best first."""
-    by_index = {record["index"]: record for record in run.records()}
     order = sorted(data["designs"], key=lambda one: (-one["objective"], one["index"]))
-    return [(one["index"], partial(design_of, run, by_index[one["index"]])) for one in order]
+    return [(one["index"], partial(Design.from_json, one["file"])) for one in order]
 
 
 def shown_volume(records: Sequence[Mapping[str, Any]], ranges: qd.Ranges) -> str:
@@ -173,8 +173,7 @@ def _features(records: Sequence[Mapping[str, Any]], ranges: qd.Ranges) -> list[d
 
 
 def _shown(
-    archive: Any, records: Sequence[Mapping[str, Any]], elites: Sequence[tuple], front: Sequence[Mapping[str, Any]],
-    ranges: qd.Ranges,
+    archive: Any, elites: Sequence[tuple], front: Sequence[Mapping[str, Any]], ranges: qd.Ranges
 ) -> list[tuple[Mapping[str, Any], tuple[int, ...], bool]]:
     """Return record, cell and whether it is an elite, of every design that can be picked: elites and the front."""
     found = {record["index"]: (record, cell, True) for cell, record in elites}

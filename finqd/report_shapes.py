@@ -16,7 +16,7 @@ from finqd.errors import FinqdError
 from finqd.export import gripper_parts
 from finqd.units import MM
 
-MAX_SHAPES = 400  # each takes about 25 ms to build
+MAX_SHAPES = 300  # each takes 20 to 30 ms to build
 BUDGET = 12_000_000  # [bytes] of all shapes together, as they stand on the page
 STEP_MM = 0.01  # of coordinates; coarser for what is larger than 655 mm
 _INT16, _UINT16 = 32767, 65535

@@ -209,7 +209,7 @@ def test_a_shape_comes_back_closed_with_the_volume_of_its_parts():
 
 
 def test_what_does_not_fit_is_missing_with_the_reason(run, data):
-    wanted = designs_shown(run, data)
+    wanted = designs_shown(data)
     assert wanted[0][0] == data["summary"]["best_index"]
     few = shapes_of(wanted, limit=2)
     assert list(few["shapes"]) == [str(index) for index, _ in wanted[:2]]

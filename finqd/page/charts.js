@@ -1,5 +1,8 @@
 // The charts, as SVG made by hand: the map, the curves, the Pareto front, the parallel coordinates. Each is drawn anew
-// into its host at the host's width. Texts from files only ever become text nodes and attributes.
+// into its host at the host's width, and leaves in `marks` what moves its mark to the design that is chosen. Texts from
+// files only ever become text nodes and attributes.
+
+const marks = {};
 
 const SVG_NAMESPACE = "http://www.w3.org/2000/svg";
 
@@ -98,33 +101,49 @@ function drawMap(host) {
     for (let i = 1; i < ax.cells; i++) root.append(svg("line", { x1: x(i), x2: x(i), y1: box.top, y2: box.bottom, class: "map-line" }));
     for (let j = 1; j < ay.cells; j++) root.append(svg("line", { x1: box.left, x2: box.right, y1: y(j), y2: y(j), class: "map-line" }));
   }
-  const reachable = [...cells.values()].find((d) => d.index === state.selected) || [...cells.values()][0];
   for (const [place, d] of cells) {
     const [i, j] = place.split(",").map(Number), share = colour.share(d), text = colour.text(d);
-    const cell = svg("g", { role: "option", class: "cell", tabindex: d === reachable ? 0 : -1, "data-index": d.index, "data-place": place,
-      "aria-selected": d.index === state.selected, "aria-label": `${cellName(d)}: ${colour.name} ${text}; ${featuresText(d)}` },
+    const cell = svg("g", { role: "option", class: "cell", tabindex: -1, "data-index": d.index, "data-place": place, "aria-selected": false, "aria-label": `${cellName(d)}: ${colour.name} ${text}; ${featuresText(d)}` },
       svg("title", {}, `${cellName(d)}\n${colour.name} ${text}\n${featuresText(d, "\n")}`),
       svg("rect", { x: x(i), y: y(j + 1), width: w, height: h, fill: share === null ? "#d9dde1" : colourAt(share) }));
     if (written) cell.append(svg("text", { x: x(i) + w / 2, y: y(j) - h / 2 + 4, "text-anchor": "middle", class: "cell-text", fill: share > 0.62 ? "#16242c" : "#fff" }, text));
     if (!matches(d)) cell.classList.add("faded");
     root.append(cell);
   }
-  markCells(root, x, y, w, h);
+  markBenchmark(root, x, y, w, h);
+  marks.map = markedCell(root, x, y, w, h);
+  marks.map();
   axisX(root, box, linear(ax.low, ax.high, box.left, box.right), ticks(ax.low, ax.high, wide / 110), titled(ax));
   if (data.axes[1]) axisY(root, box, linear(ay.low, ay.high, box.bottom, box.top), ticks(ay.low, ay.high, height / 70), titled(ay));
   root.addEventListener("click", (e) => { const cell = e.target.closest(".cell"); if (cell) select(Number(cell.dataset.index), { focus: "map" }); });
   root.addEventListener("keydown", (e) => moveOnMap(e, cells));
 }
 
-// The benchmark's cell, and the one that is selected, drawn over all others.
-function markCells(root, x, y, w, h) {
+function markBenchmark(root, x, y, w, h) {
   const b = data.benchmark;
   if (b && b.cell && b.cell.length <= 2) {
-    root.append(svg("rect", { x: x(b.cell[0]) + 1.5, y: y((b.cell[1] ?? 0) + 1) + 1.5, width: Math.max(2, w - 3), height: Math.max(2, h - 3), class: "benchmark-cell" },
+    root.append(svg("rect", { x: x(b.cell[0]) + 1.5, y: y((b.cell[1] ?? 0) + 1) + 1.5, width: Math.max(2, w - 3), height: Math.max(2, h - 3), class: "benchmark-ground" }),
+      svg("rect", { x: x(b.cell[0]) + 1.5, y: y((b.cell[1] ?? 0) + 1) + 1.5, width: Math.max(2, w - 3), height: Math.max(2, h - 3), class: "benchmark-cell" },
       svg("title", {}, `${b.name} lies here: ${featureValues(b.features)}`)));
   }
-  const d = byIndex.get(state.selected);
-  if (d) root.append(svg("rect", { x: x(d.cell[0]) - 1, y: y((d.cell[1] ?? 0) + 1) - 1, width: w + 2, height: h + 2, class: "selected-cell" }));
+}
+
+// Frames the chosen cell, and makes it the one that the tab key reaches.
+function markedCell(root, x, y, w, h) {
+  const frameOf = svg("rect", { width: w + 2, height: h + 2, class: "selected-cell" });
+  let last = null;
+  return () => {
+    const d = byIndex.get(state.selected), now = root.querySelector(`[data-index="${state.selected}"]`) || root.querySelector(".cell");
+    if (last) { last.setAttribute("tabindex", -1); last.setAttribute("aria-selected", false); }
+    last = now;
+    now.setAttribute("tabindex", 0);
+    now.setAttribute("aria-selected", Number(now.dataset.index) === state.selected);
+    frameOf.remove();
+    if (!d) return;
+    frameOf.setAttribute("x", x(d.cell[0]) - 1);
+    frameOf.setAttribute("y", y((d.cell[1] ?? 0) + 1) - 1);
+    root.append(frameOf);
+  };
 }
 
 // The nearest filled cell in the direction of the key: what lies straight ahead counts for more than what lies aside.
@@ -154,14 +173,14 @@ function drawLegend(host) {
 // -- curves -----------------------------------------------------------------------------------------------------------
 
 function drawCurves(host) {
-  const c = data.curves, minutes = c.seconds[c.seconds.length - 1] > 600;
-  const time = minutes ? { name: "computing time [min]", values: c.seconds.map((s) => s / 60) } : { name: "computing time [s]", values: c.seconds };
+  const c = data.curves, total = c.seconds[c.seconds.length - 1], [unit, length] = total > 36000 ? ["h", 3600] : total > 600 ? ["min", 60] : ["s", 1];
+  const time = { name: `computing time [${unit}]`, values: c.seconds.map((s) => s / length) };
   const kinds = [["coverage", "coverage [% of cells]", c.coverage.map((v) => 100 * v)], ["score", "QD score", c.score]];
   const panels = kinds.flatMap((kind) => [["evaluations", c.evaluations], [time.name, time.values]].map((across) => [kind, across]));
   host.replaceChildren(...panels.map(() => html("div", { class: "panel" })));
   panels.forEach(([[id, title, values], [xName, xs]], k) => {
     const last = values[values.length - 1], label = `${title} against ${xName}: ${number(last)} after ${number(xs[xs.length - 1])}`;
-    const { root, width, box } = frame(host.children[k], { height: 220, left: 62, right: 16, label });
+    const { root, width, box } = frame(host.children[k], { height: 220, left: 62, right: 30, label });
     const x = linear(0, Math.max(xs[xs.length - 1], 1e-9), box.left, box.right), y = linear(0, Math.max(...values, 1e-9) * 1.06, box.bottom, box.top);
     axisY(root, box, y, ticks(0, Math.max(...values, 1e-9), 4), title, { grid: true });
     axisX(root, box, x, ticks(0, Math.max(xs[xs.length - 1], 1e-9), width / 90), xName);
@@ -206,8 +225,16 @@ function drawPareto(host) {
 }
 
 function markOnPareto(root, x, y, box) {
-  const { key } = data.pareto, d = byIndex.get(state.selected), b = data.benchmark;
-  if (d) root.append(svg("circle", { cx: x(d.features[key]), cy: y(d.fitness), r: 10, class: "selected-ring" }));
+  const { key } = data.pareto, b = data.benchmark, ring = svg("circle", { r: 10, class: "selected-ring" });
+  marks.pareto = () => {
+    const d = byIndex.get(state.selected);
+    ring.remove();
+    if (!d) return;
+    ring.setAttribute("cx", x(d.features[key]));
+    ring.setAttribute("cy", y(d.fitness));
+    root.append(ring);
+  };
+  marks.pareto();
   if (!b || !Number.isFinite(b.features[key])) return;
   const at = x(b.features[key]), known = Number.isFinite(b.fitness), right = at > (box.left + box.right) / 2;
   root.append(svg("line", { x1: at, x2: at, y1: box.top, y2: box.bottom, class: "benchmark-line" }),
@@ -223,13 +250,16 @@ function drawParallel(host) {
   const inner = html("div", { class: "parallel-inner" });
   inner.style.minWidth = `${Math.max(0, 66 * axes.length)}px`;
   host.replaceChildren(inner);
-  const height = 400, canvas = html("canvas", { "aria-hidden": "true" });
+  const height = 400, canvas = html("canvas", { "aria-hidden": "true" }), over = html("canvas", { "aria-hidden": "true" });
   const { root, width, box } = frame(inner, { height, left: 40, right: 40, top: 78, bottom: 30, label: `Parallel coordinates of ${elites.length} elites over ${axes.length} axes` });
   root.setAttribute("role", "group");
-  inner.prepend(canvas);
+  inner.prepend(canvas, over);
   const at = (k) => box.left + (k * (box.right - box.left)) / Math.max(1, axes.length - 1);
   const scales = axes.map((axis) => linear(axis.low, axis.high, box.bottom, box.top));
-  paintLines(canvas, width, height, elites, axes, at, scales);
+  const path = (pen, d) => { pen.beginPath(); axes.forEach((axis, k) => (k ? pen.lineTo(at(k), scales[k](axis.value(d))) : pen.moveTo(at(k), scales[k](axis.value(d))))); };
+  paintLines(cleared(canvas, width, height), elites, path);
+  marks.parallel = () => paintChosen(cleared(over, width, height), path);
+  marks.parallel();
   axes.forEach((axis, k) => {
     const axisGroup = svg("g", { transform: `translate(${at(k)} 0)`, class: "parallel-axis" }), limit = state.limits[axis.key];
     axisGroup.append(svg("line", { y1: box.top, y2: box.bottom, class: "axis-line" }),
@@ -255,22 +285,33 @@ function wrapped(name) {
   return lines;
 }
 
-function paintLines(canvas, width, height, elites, axes, at, scales) {
-  const ratio = window.devicePixelRatio || 1, pen = canvas.getContext("2d"), colour = colourings()[state.colour];
+function cleared(canvas, width, height) {
+  const ratio = window.devicePixelRatio || 1, pen = canvas.getContext("2d");
   [canvas.width, canvas.height] = [ratio * width, ratio * height];
   [canvas.style.width, canvas.style.height] = [`${width}px`, `${height}px`];
   pen.scale(ratio, ratio);
-  const line = (d, style, thickness, alpha) => {
-    pen.beginPath();
-    axes.forEach((axis, k) => { const y = scales[k](axis.value(d)); return k ? pen.lineTo(at(k), y) : pen.moveTo(at(k), y); });
+  return pen;
+}
+
+function paintLines(pen, elites, path) {
+  const colour = colourings()[state.colour], fine = elites.filter(matches), line = (d, style, thickness, alpha) => {
+    path(pen, d);
     [pen.strokeStyle, pen.lineWidth, pen.globalAlpha] = [style, thickness, alpha];
     pen.stroke();
   };
-  const fine = elites.filter(matches), dense = Math.max(0.25, Math.min(0.85, 40 / Math.max(1, fine.length)));
+  const dense = Math.max(0.25, Math.min(0.85, 40 / Math.max(1, fine.length)));
   for (const d of elites) if (!matches(d)) line(d, "#c9cfd4", 1, 0.35);
   for (const d of [...fine].sort((a, b) => a.objective - b.objective)) line(d, colourAt(colour.share(d) ?? 0), 1.3, dense);
+}
+
+function paintChosen(pen, path) {
   const chosen = byIndex.get(state.selected);
-  if (chosen) { line(chosen, "#fff", 5, 1); line(chosen, "#c2410c", 2.6, 1); }
+  if (!chosen) return;
+  for (const [style, thickness] of [["#fff", 5], ["#c2410c", 2.6]]) {
+    path(pen, chosen);
+    [pen.strokeStyle, pen.lineWidth] = [style, thickness];
+    pen.stroke();
+  }
 }
 
 function brushable(axis, k, box, scale) {

@@ -67,8 +67,8 @@ function select(index, { focus = null, scroll = false } = {}) {
   state.selected = index;
   try { history.replaceState(null, "", `#design=${index}`); } catch { /* some viewers of local files forbid it */ }
   showDesign();
-  drawCharts();
-  drawList();
+  for (const mark of Object.values(marks)) mark();
+  for (const row of document.querySelectorAll("#list tbody tr")) row.classList.toggle("selected", Number(row.dataset.index) === index);
   if (focus === "map") document.querySelector(`#map [data-index="${index}"]`)?.focus({ preventScroll: true });
   if (focus === "front") document.querySelector(`#pareto-chart [data-index="${index}"]`)?.focus({ preventScroll: true });
   if (focus === "list") document.querySelector(`#list [data-index="${index}"] button`)?.focus({ preventScroll: true });
@@ -94,6 +94,7 @@ function refilter() {
 
 function drawCharts() {
   const map = document.getElementById("map");
+  for (const name of Object.keys(marks)) delete marks[name];
   if (data.designs.some((d) => d.elite)) drawMap(map);
   else map.replaceChildren(html("p", { class: "empty" }, data.summary.evaluations ? "No cell is filled: no design was evaluated to its end. See the failures below." : "Nothing was evaluated yet."));
   drawLegend(document.getElementById("legend"));
