@@ -99,9 +99,9 @@ def _elite(run: Path, cell: str | None, settings: Sequence[str]) -> Any:
 
 def _place(cell: str, dims: tuple[int, ...]) -> tuple[int, ...]:
     """Return the cell that a text names."""
-    expected = f"must be {len(dims)} whole numbers, each from 0 to {', '.join(str(n - 1) for n in dims)}, as in " + (
-        f"{_joined([n // 2 for n in dims])}, not {cell!r}"
-    )
+    corners, middle = [[0] * len(dims), [n - 1 for n in dims]], [n // 2 for n in dims]
+    allowed = " to ".join(map(_joined, corners))
+    expected = f"must be {len(dims)} whole numbers from {allowed}, as in {_joined(middle)}, not {cell!r}"
     try:
         place = tuple(int(text) for text in cell.split(","))
     except ValueError as error:

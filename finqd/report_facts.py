@@ -10,6 +10,7 @@ from typing import Any
 from finqd.assumptions import ASSUMPTIONS, reductions_of
 from finqd.effects import EFFECTS, effects_of
 from finqd.errors import FinqdError
+from finqd.presets import DEFAULT, apply_preset
 
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
@@ -72,7 +73,8 @@ def stated(run: Any, records: Sequence[Mapping[str, Any]], elites: Sequence[tupl
     assumed = [*ASSUMPTIONS, *dict.fromkeys(s for record in records for s in record.get("assumptions") or ())]
     if not elites:
         return {"assumptions": assumed, "reductions": {}, "effects": []}
-    design = design_of(run, elites[0][1])
+    preset = elites[0][1].get("preset") or run.settings.get("confirm") or run.settings.get("preset") or DEFAULT
+    design = apply_preset(design_of(run, elites[0][1]), preset)
     grasps = [row["effects"] for _, record in elites for row in record["objects"].values() if row.get("effects")]
     effects = [
         {"name": name.replace("_", " "), "state": state, "what": EFFECTS[name].what if name in EFFECTS else "",

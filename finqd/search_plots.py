@@ -141,7 +141,7 @@ def _pareto(records: Sequence[qd.Record], elites: Sequence[tuple], volume: str) 
         axes.scatter(*(zip(*points) if points else ((), ())), label=name, **style)
     if front:
         axes.step(*zip(*[(r["features"][volume], r["fitness"]) for r in front]), where="post", color=INK, linewidth=1.2)
-        axes.legend(frameon=False, loc="lower right")
+    axes.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
     axes.set(xlabel=label(volume), ylabel="fitness (share of objects held)", ylim=(-0.03, 1.05))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
     _plain(axes)

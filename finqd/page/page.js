@@ -158,7 +158,7 @@ function wire() {
   on("copy", "click", async (e) => { try { await navigator.clipboard.writeText(document.getElementById("export-command").textContent); e.target.textContent = "Copied"; } catch { getSelection().selectAllChildren(document.getElementById("export-command")); } });
   let waiting = 0;
   let width = document.documentElement.clientWidth;
-  window.addEventListener("resize", () => { clearTimeout(waiting); waiting = setTimeout(() => { if (width === document.documentElement.clientWidth) return; width = document.documentElement.clientWidth; drawCharts(); drawCurves(document.getElementById("curve-panels")); }, 120); });
+  window.addEventListener("resize", () => { clearTimeout(waiting); waiting = setTimeout(() => { if (width === document.documentElement.clientWidth) return; width = document.documentElement.clientWidth; drawCharts(); drawCurves(document.getElementById("curve-panels")); drawSensitivity(); }, 120); });
 }
 
 drawHeader();

@@ -146,8 +146,17 @@ function glPainter(canvas) {
   };
 }
 
+// The corners of a face's pieces, none with an edge longer than `longest`: painting by depth needs small faces.
+function pieces(corners, longest) {
+  const lengths = corners.map((p, k) => Math.hypot(...p.map((x, i) => x - corners[(k + 1) % 3][i]))), k = lengths.indexOf(Math.max(...lengths));
+  if (lengths[k] <= longest) return [corners];
+  const [a, b, c] = [0, 1, 2].map((i) => corners[(k + i) % 3]), middle = a.map((x, i) => (x + b[i]) / 2);
+  return [...pieces([a, middle, c], longest), ...pieces([middle, b, c], longest)];
+}
+
 function flatPainter(canvas) {
   const pen = canvas.getContext("2d");
+  let loaded = null, split = [];
   const css = (colour, light) => `rgb(${colour.map((c) => Math.round(255 * Math.min(1, c * light))).join(" ")})`;
   return (model, turn, distance, focus) => {
     const turned = (p, c) => [0, 3, 6].map((r) => turn[r] * (p[0] - c[0]) + turn[r + 1] * (p[1] - c[1]) + turn[r + 2] * (p[2] - c[2]));
@@ -162,8 +171,12 @@ function flatPainter(canvas) {
     pen.lineWidth = window.devicePixelRatio || 1;
     pen.strokeStyle = css(GRID_COLOUR, 1);
     for (const line of model.grid) { path(line.map((p) => turned(p, model.centre))); pen.stroke(); }
+    if (loaded !== model) {
+      split = model.faces.flatMap((f) => pieces(f.corners, 0.12 * model.radius).map((corners) => ({ ...f, corners })));
+      loaded = model;
+    }
     const faces = [];
-    for (const f of model.faces) {
+    for (const f of split) {
       const n = turned(f.normal, [0, 0, 0]), corners = f.corners.map((p) => turned(p, model.centre));
       const middle = [0, 1, 2].map((i) => (corners[0][i] + corners[1][i] + corners[2][i]) / 3);
       if (n[0] * -middle[0] + n[1] * -middle[1] + n[2] * (distance - middle[2]) <= 0) continue;
