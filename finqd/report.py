@@ -72,7 +72,7 @@ def report_data(run: Any, *, name: str, argument: str = "RUN", benchmark: Path |
         "benchmark": compared, "chosen": choose(designs, volume, compared),
         "sensitivity": sensitivity(records, [path for path, _ in run.parameters]),
         "failures": failures(records), "object_failures": object_failures(records),
-        "rechecks": rechecks_of(run.rechecks(), elites, archive.cells),
+        "rechecks": rechecks_of(run),
         "presets": presets_of(run, records), **stated(run, records, elites), "settings": settings_table(run.settings),
         "colours": colour_stops(),
     })  # fmt: skip

@@ -1,64 +1,33 @@
-"""What rechecks of elites say of a map: how far fitness can be trusted where conditions are a little other."""
+"""What rechecks of elites say of a map (`finqd.trust`), as its page shows it."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
+
+SHOWN = ("rechecks", "failed", "objective", "success", "keeps", "flips")  # of an elite
 
 
-def rechecks_of(
-    rows: Sequence[Mapping[str, Any]], elites: Sequence[tuple[tuple[int, ...], Mapping[str, Any]]], cells: int
-) -> dict[str, Any] | None:
-    """Return what the rechecks found, or None if there are none.
+def rechecks_of(run: Any) -> dict[str, Any] | None:
+    """Return what the rechecks of a run found, of those by the scheme that was used last, or None if there are none.
 
-    ``elites``: index -> its rows in short, ``success`` (mean fitness over its rechecks, failed ones counting 0: how
-    likely one of the objects is held), ``flips`` (share of verdicts, object by object, other than the log's) and
-    ``worst`` fitness. ``raw`` and ``corrected``: coverage and QD score of the rechecked elites as logged and with
-    ``success`` and the mean objective in the place of what was logged.
+    ``elites``: index -> what is shown of an elite that was rechecked; ``raw`` and ``corrected``: QD score and coverage
+    of those; ``objects``: verdicts of each object, pooled over the elites; ``definition``: what all of that means.
     """
-    if not rows:
+    if not run.rechecks():
         return None
-    by_index: dict[int, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        by_index.setdefault(row["index"], []).append(row)
-    found = {}
-    for _, record in elites:
-        if record["index"] in by_index:
-            found[str(record["index"])] = _one(record, by_index[record["index"]])
-    objective = {str(record["index"]): record["objective"] for _, record in elites}
-    names = sorted({name for row in rows for name in row.get("perturbation") or {}})
+    from finqd.recheck import trust_of
+    from finqd.trust import DEFINITION
+
+    found = trust_of(run)
+    assert found is not None  # there are rows
+    told = found.to_dict()
     return {
-        "perturbed": names, "rows": len(rows), "elites": found, "rechecked": len(found), "of": len(elites),
-        "raw": {"coverage": len(found) / cells, "qd_score": math.fsum(objective[index] for index in found)},
-        "corrected": {
-            "coverage": sum(one["finished"] > 0 for one in found.values()) / cells,
-            "qd_score": math.fsum(one["objective"] for one in found.values()),
+        "definition": DEFINITION, "rows": len(run.rechecks()), "count": found.rechecks, "complete": found.complete,
+        "ranges": told["scheme"].get("ranges", {}), "raw": told["raw"], "corrected": told["corrected"],
+        "elites": {
+            str(one["index"]): {key: one[key] for key in SHOWN}
+            for one in told["elites"] if one["rechecks"]
         },
-    }
-
-
-def _one(record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    from finqd.archive import objective
-
-    fitness = [row["fitness"] if row["status"] == "ok" and row["fitness"] is not None else 0.0 for row in rows]
-    n = max(1, len(record["objects"]))
-    scores = [
-        objective(row["fitness"], row["margin"], n) if row["status"] == "ok" and row["fitness"] is not None else 0.0
-        for row in rows
-    ]
-    compared = flipped = 0
-    for row in rows:
-        for name, logged in record["objects"].items():
-            seen = (row.get("objects") or {}).get(name, {})
-            if seen.get("held") is not None and logged.get("held") is not None:
-                compared += 1
-                flipped += bool(seen["held"]) != bool(logged["held"])
-    short = [{key: row.get(key) for key in ("perturbation", "status", "reason", "fitness", "margin")} for row in rows]
-    return {
-        "rows": short, "success": float(np.mean(fitness)), "worst": min(fitness), "objective": float(np.mean(scores)),
-        "finished": sum(row["status"] == "ok" for row in rows), "verdicts": compared,
-        "flips": flipped / compared if compared else None,
-    }
+        "of": len(told["elites"]), "objects": told["objects"],
+    }  # fmt: skip

@@ -129,7 +129,11 @@ def recheck_rows(record: dict[str, Any]) -> list[dict[str, Any]]:
     for k, friction in enumerate((0.5, 0.6, 0.7)):
         objects = {name: {**row, "held": row["margin"] > 0.25 - 0.2 * k} for name, row in record["objects"].items()}
         fitness = sum(row["held"] for row in objects.values()) / len(objects)
-        rows.append({"index": record["index"], "perturbation": {"friction": friction}, "fitness": fitness,
-                     "margin": record["margin"] + 0.1 * (k - 1), "features": record["features"], "objects": objects,
-                     "status": "ok", "reason": "", "seconds": 40.0})  # fmt: skip
+        margin = record["margin"] + 0.1 * (k - 1)
+        rows.append({
+            "index": record["index"], "number": k, "perturbation": {"friction": friction}, "preset": "standard",
+            "scheme": {"seed": 0, "ranges": {"friction": [0.5, 0.7, "uniform"]}}, "fitness": fitness, "margin": margin,
+            "objective": qd.objective(fitness, margin, len(objects)), "features": record["features"],
+            "objects": objects, "status": "ok", "reason": "", "seconds": 40.0,
+        })  # fmt: skip
     return rows

@@ -26,7 +26,7 @@ HOSTILE = '</script><img src=x onerror="document.title=1"><!-- &amp; {{script}}'
 
 @pytest.fixture(scope="module")
 def run() -> SyntheticRun:
-    return synthetic_run(60, cells=6, rechecked=5)
+    return synthetic_run(60, cells=6)
 
 
 @pytest.fixture(scope="module")
@@ -128,15 +128,17 @@ def test_failures_that_differ_by_a_number_are_counted_together(run, data):
     assert late["count"] == sum(record["status"] == "timeout" for record in failed)
 
 
-def test_rechecks_are_summed_up_by_elite(run, data):
-    found = data["rechecks"]
-    assert found["rechecked"] == 5 and found["rows"] == 15 and found["perturbed"] == ["friction"]
+def test_rechecks_are_summed_up_by_elite(tmp_path):
+    pytest.importorskip("finqd.trust")
+    run = synthetic_run(30, cells=4, rechecked=3)
+    found = report_data(run, name="a")["rechecks"]
+    assert len(found["elites"]) == 3 and found["rows"] == 9 and found["count"] == 3 and found["of"] == len(run.elites())
     index, one = next(iter(found["elites"].items()))
     rows = [row for row in run.rechecks() if row["index"] == int(index)]
     record = run.records()[int(index)]
-    flips = [row["objects"][n]["held"] != record["objects"][n]["held"] for row in rows for n in OBJECTS]
-    assert one["success"] == pytest.approx(np.mean([row["fitness"] for row in rows]))
-    assert one["flips"] == pytest.approx(np.mean(flips)) and one["worst"] == min(row["fitness"] for row in rows)
+    verdicts = [(row["objects"][name]["held"], record["objects"][name]["held"]) for row in rows for name in OBJECTS]
+    assert one["success"]["rate"] == pytest.approx(np.mean([now for now, _ in verdicts]))
+    assert one["flips"]["rate"] == pytest.approx(np.mean([now != then for now, then in verdicts]))
     objectives = [run.records()[int(i)]["objective"] for i in found["elites"]]
     assert found["raw"]["qd_score"] == pytest.approx(math.fsum(objectives))
 

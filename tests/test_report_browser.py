@@ -9,6 +9,7 @@ import io
 import os
 import shutil
 import time
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def browsers(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run():
-    made = synthetic_run(60, cells=6, rechecked=4)
+    made = synthetic_run(60, cells=6, rechecked=4 if find_spec("finqd.trust") else 0)
     for record in made.told:
         rows = record["objects"]
         record["objects"] = {HOSTILE if name == "cube" else name: row for name, row in rows.items()}

@@ -16,10 +16,7 @@ function colourings() {
     fitness: { name: "fitness", share: (d) => d.fitness, text: (d) => number(d.fitness, 2), low: "0", high: "1, share of objects held" },
     margin: { name: "margin", share: (d) => (d.margin + 1) / 2, text: (d) => number(d.margin, 2), low: "−1", high: "1, mean over the objects" },
   };
-  if (data.rechecks) {
-    const of = (d) => data.rechecks.elites[d.index];
-    found.rechecked = { name: "mean fitness, rechecked", share: (d) => of(d)?.success ?? null, text: (d) => number(of(d)?.success, 2), low: "0", high: "1, grey: not rechecked" };
-  }
+  if (data.rechecks) found.rechecked = { name: "held in rechecks", share: success, text: (d) => percent(success(d)), low: "0 %", high: "100 %, grey: not rechecked" };
   for (const f of data.features.filter(isMain)) {
     const [low, high] = span(data.designs.map((d) => d.features[f.key]));
     found[f.key] = { name: f.name, share: (d) => (d.features[f.key] - low) / (high - low || 1), text: (d) => number(d.features[f.key], 3), low: number(low), high: withUnit(high, f.unit) };

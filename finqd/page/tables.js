@@ -8,6 +8,10 @@ const isMain = (feature) => data.axes.some((axis) => axis.key === feature.key) |
 const featureValues = (values) => data.features.filter(isMain).map((f) => `${f.name} ${withUnit(values[f.key], f.unit)}`).join(", ");
 const featuresText = (d, between = ", ") => data.features.filter(isMain).map((f) => `${f.name} ${withUnit(d.features[f.key], f.unit)}`).join(between);
 
+const percent = (share) => (share === null || share === undefined ? "–" : `${number(Math.round(1000 * share) / 10)} %`);
+const intervalText = (share) => share.interval_95.map((end) => number(Math.round(1000 * end) / 10)).join(" to ") + " %";
+const success = (d) => data.rechecks?.elites[d.index]?.success.rate ?? null;
+
 const MARKS = { held: ["✓", "held"], lost: ["✕", "lost"], failed: ["!", "simulation failed"] };
 function verdict(row) {
   const kind = held(row);
@@ -38,7 +42,7 @@ function showDesign() {
     facts.push([f.name, withUnit(d.features[f.key], f.unit), known ? `${change > 0 ? "+" : ""}${number(Math.round(change * 10) / 10)} % against ${b.name}` : ""]);
   }
   const checked = data.rechecks && data.rechecks.elites[d.index];
-  if (checked) facts.push(["rechecked", `${number(checked.success, 3)} mean fitness`, `${checked.rows.length} times under other conditions; worst ${number(checked.worst, 3)}`]);
+  if (checked) facts.push(["held in rechecks", percent(checked.success.rate), `${intervalText(checked.success)} with 95 % confidence, ${checked.rechecks} rechecks under other conditions`]);
   document.getElementById("design-facts").replaceChildren(...facts.map(([name, value, note]) => html("div", {}, html("dt", {}, name), html("dd", {}, value, note ? html("small", {}, note) : null))));
   showShape(d);
   document.getElementById("design-objects").replaceChildren(objectTable(d));
@@ -96,7 +100,7 @@ function listColumns() {
   const columns = [{ name: "cell", value: (d) => d.cell.join(", "), order: (d) => d.index, left: true }, { name: "holds", value: heldCount, order: heldCount }];
   columns.push({ name: "fitness", value: (d) => number(d.fitness), order: (d) => d.fitness }, { name: "margin", value: (d) => number(d.margin, 3), order: (d) => d.margin });
   for (const f of data.features.filter(isMain)) columns.push({ name: titled(f), value: (d) => number(d.features[f.key]), order: (d) => d.features[f.key] });
-  if (data.rechecks) columns.push({ name: "rechecked", value: (d) => number(data.rechecks.elites[d.index]?.success, 3), order: (d) => data.rechecks.elites[d.index]?.success ?? -1 });
+  if (data.rechecks) columns.push({ name: "held in rechecks", value: (d) => percent(success(d)), order: (d) => success(d) ?? -1 });
   return columns;
 }
 
@@ -126,7 +130,7 @@ function drawCompare() {
   const line = (name, values, kind = "total") => html("tr", { class: kind }, html("th", { scope: "row" }, name), cellsOf(values));
   rows.push(line("fitness", all.map((one) => number(one.fitness)), "total first"), line("margin", all.map((one) => number(one.margin, 3))));
   for (const f of data.features.filter(isMain)) rows.push(line(titled(f), all.map((one) => against(one, b, f))));
-  if (data.rechecks) rows.push(line("mean fitness, rechecked", all.map((one) => number(data.rechecks.elites[one.index]?.success, 3))));
+  if (data.rechecks) rows.push(line("held in rechecks", all.map((one) => percent(success(one)))));
   host.replaceChildren(table(heads, rows));
   const notes = b ? [...b.notes.map((n) => `${b.name}: ${n}.`)] : [];
   const note = document.getElementById("compare-note");
@@ -169,17 +173,34 @@ function drawFailures() {
 }
 
 function drawRechecks() {
-  const r = data.rechecks, section = document.getElementById("rechecks");
-  if (!r) { section.querySelector(".body").replaceChildren(html("p", { class: "empty" }, "No elite was rechecked. ", html("code", {}, "finqd optimise … --recheck K"), " evaluates elites again under slightly other conditions.")); return; }
-  const change = table(["", { text: "as logged", number: true }, { text: "rechecked", number: true }], [
-    html("tr", {}, html("th", { scope: "row" }, "coverage of rechecked elites [% of cells]"), cellsOf([number(100 * r.raw.coverage), number(100 * r.corrected.coverage)])),
-    html("tr", {}, html("th", { scope: "row" }, "their QD score"), cellsOf([number(r.raw.qd_score), number(r.corrected.qd_score)]))]);
-  const rows = Object.entries(r.elites).map(([index, one]) => [byIndex.get(Number(index)), one]).filter(([d]) => d).sort((a, b) => b[1].success - a[1].success || b[0].objective - a[0].objective)
-    .map(([d, one]) => html("tr", {}, html("td", {}, html("button", { type: "button", class: "link", onclick: () => select(d.index, { scroll: true }) }, `cell ${d.cell.join(", ")}`)),
-      cellsOf([number(d.fitness), number(one.success, 3), number(one.worst, 3), `${one.finished} of ${one.rows.length}`, one.flips === null ? "–" : `${number(100 * one.flips, 3)} %`])));
-  section.querySelector(".body").replaceChildren(
-    html("p", {}, `${r.rechecked} of ${r.of} elites, ${r.rows} evaluations with other ${r.perturbed.map((n) => n.replaceAll("_", " ")).join(", ") || "conditions"}. Mean fitness is how likely one of the objects is held; a recheck that failed counts 0. A flip is an object whose verdict is not the log's.`), change,
-    table(["elite", { text: "fitness", number: true }, { text: "mean fitness", number: true }, { text: "worst", number: true }, { text: "finished", number: true }, { text: "verdicts flipped", number: true }], rows));
+  const r = data.rechecks, body = document.querySelector("#rechecks .body");
+  if (!r) {
+    body.replaceChildren(html("p", { class: "empty" }, "No elite was rechecked. ", html("code", {}, `finqd recheck ${data.run_argument}`), " evaluates the elites again under slightly other conditions."));
+    return;
+  }
+  const elites = Object.entries(r.elites).map(([index, one]) => [byIndex.get(Number(index)), one]).filter(([d]) => d);
+  const ranges = Object.entries(r.ranges).map(([name, [low, high]]) => `${name.replaceAll("_", " ")} ${number(low)} to ${number(high)}`).join("; ");
+  body.replaceChildren(html("p", {}, `${elites.length} of ${r.of} elites, ${r.count} rechecks each${r.complete ? "" : " (not all are there yet)"}. Varied: ${ranges || "nothing"}.`),
+    scoreTable(r), eliteRechecks(elites), objectRechecks(r), html("p", { class: "note" }, r.definition));
+}
+
+function scoreTable(r) {
+  const row = (name, raw, corrected) => html("tr", {}, html("th", { scope: "row" }, name), cellsOf([raw, corrected]));
+  return table(["of the elites that were rechecked", { text: "raw", number: true }, { text: "corrected", number: true }],
+    [row("coverage", percent(r.raw.coverage), percent(r.corrected.coverage)), row("QD score", number(r.raw.qd_score), number(r.corrected.qd_score))]);
+}
+
+function eliteRechecks(elites) {
+  const heads = ["elite", ...["fitness", "held in rechecks", "95 % interval", "keeps its objects", "verdicts flipped", "failed"].map((text) => ({ text, number: true }))];
+  elites.sort((a, b) => b[1].success.rate - a[1].success.rate || b[0].objective - a[0].objective);
+  return table(heads, elites.map(([d, one]) => html("tr", {},
+    html("td", {}, html("button", { type: "button", class: "link", onclick: () => select(d.index, { scroll: true }) }, `cell ${d.cell.join(", ")}`)),
+    cellsOf([number(d.fitness), percent(one.success.rate), intervalText(one.success), `${one.keeps.part} of ${one.keeps.whole}`, percent(one.flips.rate), `${one.failed} of ${one.rechecks}`]))));
+}
+
+function objectRechecks(r) {
+  const heads = ["object, over all elites", { text: "held in rechecks", number: true }, { text: "verdicts flipped", number: true }];
+  return table(heads, Object.entries(r.objects).map(([name, one]) => html("tr", {}, html("th", { scope: "row" }, name), cellsOf([percent(one.held.rate), percent(one.flips.rate)]))));
 }
 
 // -- facts ------------------------------------------------------------------------------------------------------------
