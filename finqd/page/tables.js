@@ -193,9 +193,10 @@ function scoreTable(r) {
 function eliteRechecks(elites) {
   const heads = ["elite", ...["fitness", "held in rechecks", "95 % interval", "keeps its objects", "verdicts flipped", "failed"].map((text) => ({ text, number: true }))];
   elites.sort((a, b) => b[1].success.rate - a[1].success.rate || b[0].objective - a[0].objective);
-  return table(heads, elites.map(([d, one]) => html("tr", {},
+  const rows = elites.map(([d, one]) => html("tr", {},
     html("td", {}, html("button", { type: "button", class: "link", onclick: () => select(d.index, { scroll: true }) }, `cell ${d.cell.join(", ")}`)),
-    cellsOf([number(d.fitness), percent(one.success.rate), intervalText(one.success), `${one.keeps.part} of ${one.keeps.whole}`, percent(one.flips.rate), `${one.failed} of ${one.rechecks}`]))));
+    cellsOf([number(d.fitness), percent(one.success.rate), intervalText(one.success), `${one.keeps.part} of ${one.keeps.whole}`, percent(one.flips.rate), `${one.failed} of ${one.rechecks}`])));
+  return html("div", rows.length > 20 ? { class: "scroll tall", tabindex: 0, role: "region", "aria-label": "Rechecks of the elites" } : {}, table(heads, rows));
 }
 
 function objectRechecks(r) {

@@ -1,0 +1,54 @@
+"""How long the page of a large search takes to make, and how large it is: 30 s and 30 MB are the bar.
+
+    python benchmarks/report_size.py [--evaluations 10000] [--cells 30] [--rechecked 0] [--out page.html]
+
+The run is made up (`tests/synthetic_run.py`): real designs of the fin ray, invented fitness, features near the real
+ones; it is held in memory, so that reading a log is in none of the seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from finqd.report import designs_shown, report_data
+from finqd.report_page import page
+from finqd.report_shapes import MAX_SHAPES, shapes_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from synthetic_run import synthetic_run  # noqa: E402
+
+
+def main() -> None:
+    """Make a run and its page; print seconds, sizes and memory."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--evaluations", type=int, default=10_000)
+    parser.add_argument("--cells", type=int, default=30, help="along each of the two axes")
+    parser.add_argument("--rechecked", type=int, default=0, help="elites with three rechecks each")
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()) / "finqd_report_size.html")
+    options = parser.parse_args()
+    begun = time.perf_counter()
+    run = synthetic_run(options.evaluations, cells=options.cells, rechecked=options.rechecked, measured=False)
+    print(f"{options.evaluations} evaluations made up in {time.perf_counter() - begun:.0f} s (not part of the report)")
+    marks = [time.perf_counter()]
+    data = report_data(run, name="made up")
+    marks.append(time.perf_counter())
+    shapes = shapes_of(designs_shown(data), limit=MAX_SHAPES)
+    marks.append(time.perf_counter())
+    options.out.write_text(page(data, shapes), encoding="utf-8")
+    marks.append(time.perf_counter())
+    for name, begin, end in zip(("numbers", "shapes", "page"), marks, marks[1:]):
+        print(f"{name:8} {end - begin:6.1f} s")
+    packed = sum(len(shape["data"]) for shape in shapes["shapes"].values())
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"together {marks[-1] - marks[0]:6.1f} s (bar: 30 s)")
+    print(f"{options.out}: {options.out.stat().st_size / 1e6:.1f} MB (bar: 30 MB), {packed / 1e6:.1f} MB of it shapes")
+    print(f"{len(data['designs'])} designs on the page, {len(shapes['shapes'])} of them in 3-D; peak {memory:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()
