@@ -17,7 +17,9 @@ from typing import Any
 
 FOLDER = Path(__file__).resolve().parent / "page"
 #: in the order in which they are read
-SCRIPTS = ("viewer.js", "charts.js", "tables.js", "page.js")
+SCRIPTS = (
+    "viewer.js", "drawing.js", "map.js", "charts.js", "parallel.js", "designs.js", "tables.js", "page.js",
+)  # fmt: skip
 
 
 def page(data: Mapping[str, Any], shapes: Mapping[str, Any]) -> str:
