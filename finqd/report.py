@@ -18,6 +18,7 @@ import numpy as np
 from finqd import __version__
 from finqd import archive as qd
 from finqd.design import Design
+from finqd.errors import FinqdError, InputError
 from finqd.labels import name_and_unit
 from finqd.report_benchmark import benchmark_of
 from finqd.report_facts import failures, object_failures, presets_of, settings_table, stated
@@ -79,16 +80,25 @@ def report_data(run: Any, *, name: str, argument: str = "RUN", benchmark: Path |
 
 
 def design_of(run: Any, record: Mapping[str, Any]) -> Design:
-    """Return the design that a record is about, decoded again from its point of the unit cube."""
+    """Return the design that a record is about, from its logged parameters.
+
+    Raises ``InputError`` if what is installed takes them no more: another finger type, or other limits.
+    """
     name = f"seed {record['seed']}, evaluation {record['index']}"
     base = {key: value for key, value in run.base.items() if key != "name"}
-    return Design.from_unit_vector(record["unit"], **base, name=name)
+    return Design.from_vector(list(record["parameters"].values()), **base, name=name)
 
 
 def designs_shown(data: Mapping[str, Any]) -> list[tuple[int, Any]]:
     """Return index and a function that makes the design of each one on the page, the best first."""
     order = sorted(data["designs"], key=lambda one: (-one["objective"], one["index"]))
-    return [(one["index"], partial(Design.from_json, one["file"])) for one in order]
+    return [(one["index"], partial(_read, one)) for one in order]
+
+
+def _read(one: Mapping[str, Any]) -> Design:
+    if one["file"] is None:
+        raise InputError(one["file_missing"])
+    return Design.from_json(one["file"])
 
 
 def shown_volume(records: Sequence[Mapping[str, Any]], ranges: qd.Ranges) -> str:
@@ -192,9 +202,14 @@ def _design_entry(run: Any, record: Mapping[str, Any], cell: tuple[int, ...], is
     kept = ("index", "iteration", "emitter", "fitness", "margin", "objective", "features", "seconds", "accuracy",
             "preset", "design_digest")
     screened = record.get("screen") or None
+    file, missing = None, ""
+    try:
+        file = design_of(run, record).to_json()
+    except FinqdError as error:
+        missing = str(error)
     return {
         **{key: record.get(key) for key in kept}, "cell": list(cell), "elite": is_elite, "objects": rows,
-        "parameters": list(record["parameters"].values()), "file": design_of(run, record).to_json(),
+        "parameters": list(record["parameters"].values()), "file": file, "file_missing": missing,
         "screen": None if screened is None else {key: screened.get(key) for key in ("fitness", "margin", "preset")},
     }
 

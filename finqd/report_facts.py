@@ -74,7 +74,10 @@ def stated(run: Any, records: Sequence[Mapping[str, Any]], elites: Sequence[tupl
     if not elites:
         return {"assumptions": assumed, "reductions": {}, "effects": []}
     preset = elites[0][1].get("preset") or run.settings.get("confirm") or run.settings.get("preset") or DEFAULT
-    design = apply_preset(design_of(run, elites[0][1]), preset)
+    try:
+        design = apply_preset(design_of(run, elites[0][1]), preset)
+    except FinqdError:  # what is installed does not know the designs of this log; each of them says so
+        return {"assumptions": assumed, "reductions": {}, "effects": []}
     grasps = [row["effects"] for _, record in elites for row in record["objects"].values() if row.get("effects")]
     effects = [
         {"name": name.replace("_", " "), "state": state, "what": EFFECTS[name].what if name in EFFECTS else "",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-
 SHOWN = ("rechecks", "failed", "objective", "success", "keeps", "flips")  # of an elite
 
 

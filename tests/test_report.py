@@ -305,6 +305,19 @@ def test_a_page_that_cannot_be_written_is_one_sentence(run, tmp_path):
         write_report(run, tmp_path / "no" / "page.html", name="a", argument="RUN")
 
 
+def test_designs_that_the_installed_version_refuses_are_shown_without_file_and_shape(tmp_path):
+    run = synthetic_run(8, cells=3)
+    for record in run.told:
+        if record["parameters"]:
+            record["parameters"]["spacing_mm"] = 1e4
+    page = written(run, tmp_path)
+    for design in embedded(page, "data")["designs"]:
+        assert design["file"] is None and "spacing_mm" in design["file_missing"]
+        missing = embedded(page, "shapes")["missing"][str(design["index"])]
+        assert missing == f"the shape could not be built: {design['file_missing']}"
+    assert embedded(page, "data")["effects"] == []
+
+
 # the benchmark --------------------------------------------------------------------------------------------------------
 
 

@@ -96,6 +96,8 @@ function showDesign() {
   const notes = [];
   if (d.screen)
     notes.push(`Screened with ${d.screen.preset ?? "a cheaper preset"}: fitness ${number(d.screen.fitness)}.`);
+  if (!d.file) notes.push(`No design file: ${d.file_missing}.`);
+  document.getElementById("design-file").hidden = !d.file;
   if (d.accuracy) notes.push(`Accuracy of the simulation: ${d.accuracy}.`);
   document.getElementById("design-notes").textContent = notes.join(" ");
   document.getElementById("compare-add").disabled = state.compared.includes(d.index);

@@ -67,7 +67,7 @@ function drawMap(host) {
             y: y(j) - h / 2 + 4,
             "text-anchor": "middle",
             class: "cell-text",
-            fill: share > 0.62 ? "#16242c" : "#fff",
+            fill: share >= 0.5 ? "#16242c" : "#fff",
           },
           text,
         ),

@@ -158,7 +158,7 @@ function setLimit(key, limit) {
 
 function refilter() {
   state.listed = LIST_STEP;
-  drawLimits();
+  showLimits();
   drawCharts();
   drawList();
   const elites = data.designs.filter((d) => d.elite),
@@ -190,35 +190,32 @@ function drawCharts() {
   drawParallel(document.getElementById("parallel-chart"));
 }
 
-// Limits by number: one row an axis, bound to the bars on the axes.
+// Limits by number: two fields an axis, bound to the bars on the axes.
 function drawLimits() {
-  const rows = axesNow.map((axis) => {
-    const limit = state.limits[axis.key] || [null, null];
-    const field = (k, name) =>
-      html(
-        "td",
-        { class: "n" },
-        html("input", {
-          type: "number",
-          step: "any",
-          value: limit[k] ?? "",
-          placeholder: number(k ? axis.high : axis.low, 4),
-          "aria-label": `${axis.name}, ${name}`,
-          "data-key": axis.key,
-          "data-end": k,
-          onchange: (e) => {
-            const now = [...(state.limits[axis.key] || [null, null])];
-            now[k] = e.target.value === "" ? null : Number(e.target.value);
-            setLimit(axis.key, now);
-            document.querySelector(`#limit-table [data-key="${CSS.escape(axis.key)}"][data-end="${k}"]`)?.focus();
-          },
-        }),
-      );
-    return html("tr", {}, html("th", { scope: "row" }, titled(axis)), field(0, "at least"), field(1, "at most"));
-  });
-  document
-    .getElementById("limit-table")
-    .replaceChildren(table(["", { text: "at least", number: true }, { text: "at most", number: true }], rows));
+  const field = (axis, end, name) =>
+    html("input", {
+      type: "number",
+      step: "any",
+      placeholder: `${name} ${number(end ? axis.high : axis.low)}`,
+      "aria-label": `${titled(axis)}, ${name}`,
+      "data-key": axis.key,
+      "data-end": end,
+      onchange: (e) => {
+        const now = [...(state.limits[axis.key] || [null, null])];
+        now[end] = e.target.value === "" ? null : Number(e.target.value);
+        setLimit(axis.key, now);
+      },
+    });
+  const row = (axis) =>
+    html("div", {}, html("span", {}, titled(axis)), field(axis, 0, "at least"), field(axis, 1, "at most"));
+  document.getElementById("limit-table").replaceChildren(...axesNow.map(row));
+  showLimits();
+}
+
+function showLimits() {
+  for (const input of document.querySelectorAll("#limit-table input")) {
+    input.value = state.limits[input.dataset.key]?.[Number(input.dataset.end)] ?? "";
+  }
 }
 
 function drawChips() {
@@ -243,7 +240,7 @@ function drawChips() {
 function drawHeader() {
   const s = data.summary,
     f = (value, name, note = "") =>
-      html("div", {}, html("dd", {}, value), html("dt", {}, name, note ? html("small", {}, note) : null));
+      html("div", {}, html("dt", {}, name, note ? html("small", {}, note) : null), html("dd", {}, value));
   const duration = (t) =>
     t < 120 ? `${number(t, 3)} s` : t < 7200 ? `${number(t / 60, 3)} min` : `${number(t / 3600, 3)} h`;
   const best = byIndex.get(s.best_index);
@@ -297,6 +294,7 @@ function wire() {
       if (key.startsWith("parameter fingers") || (!["fitness", "margin"].includes(key) && key.startsWith("parameter ")))
         delete state.limits[key];
     axesNow = parallelAxes();
+    drawLimits();
     refilter();
   });
   for (const button of document.querySelectorAll(".lift"))
@@ -343,6 +341,7 @@ function wire() {
 drawHeader();
 wire();
 drawChips();
+drawLimits();
 refilter();
 drawCurves(document.getElementById("curve-panels"));
 drawCompare();

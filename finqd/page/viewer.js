@@ -158,7 +158,7 @@ function glPainter(canvas) {
     gl.vertexAttribPointer(at, 3, gl.FLOAT, false, 24, 12 * i);
   });
   let loaded = null,
-    counts = [0, 0];
+    counts = [0, 0, 0];
   return (model, turn, distance, focus) => {
     if (loaded !== model) {
       const rows = [];
@@ -166,7 +166,8 @@ function glPainter(canvas) {
       for (const line of model.edges) for (const p of line) rows.push(...p, ...EDGE_COLOUR);
       for (const line of model.grid) for (const p of line) rows.push(...p, ...GRID_COLOUR);
       gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(rows), gl.STATIC_DRAW);
-      counts = [3 * model.faces.length, 2 * (model.edges.length + model.grid.length)];
+      const edges = 2 * model.edges.length;
+      counts = [3 * model.faces.length, edges, edges + 2 * model.grid.length];
       loaded = model;
     }
     gl.viewport(0, 0, canvas.width, canvas.height);
@@ -180,7 +181,7 @@ function glPainter(canvas) {
     gl.drawArrays(gl.TRIANGLES, 0, counts[0]);
     gl.uniform4f(where("lens"), distance, ...zoom, 1); // lines a little nearer than the faces that they bound
     gl.uniform1f(where("shaded"), 0);
-    gl.drawArrays(gl.LINES, counts[0], counts[1]);
+    gl.drawArrays(gl.LINES, counts[0], turn[8] < -0.1 ? counts[1] : counts[2]); // no floor between it and who looks up
   };
 }
 
@@ -215,7 +216,7 @@ function flatPainter(canvas) {
     pen.lineJoin = "round";
     pen.lineWidth = window.devicePixelRatio || 1;
     pen.strokeStyle = css(GRID_COLOUR, 1);
-    for (const line of model.grid) {
+    for (const line of turn[8] < -0.1 ? [] : model.grid) {
       path(line.map((p) => turned(p, model.centre)));
       pen.stroke();
     }
