@@ -70,7 +70,7 @@ def stated(run: Any, records: Sequence[Mapping[str, Any]], elites: Sequence[tupl
     """Return assumptions, reductions and effects, as they hold for the designs of the run; how often each was met."""
     from finqd.report import design_of
 
-    assumed = [*ASSUMPTIONS, *dict.fromkeys(s for record in records for s in record.get("assumptions") or ())]
+    assumed = list(dict.fromkeys([*ASSUMPTIONS, *(s for record in records for s in record.get("assumptions") or ())]))
     if not elites:
         return {"assumptions": assumed, "reductions": {}, "effects": []}
     preset = elites[0][1].get("preset") or run.settings.get("confirm") or run.settings.get("preset") or DEFAULT

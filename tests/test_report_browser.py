@@ -5,11 +5,13 @@ Debian's chromium and chromium-driver (which `./dev test` installs where it may)
 
 from __future__ import annotations
 
+import base64
 import io
 import os
 import shutil
 import time
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -300,6 +302,29 @@ def test_nothing_sticks_out_of_the_window(browsers, page, width):
         assert browser.script("document.documentElement.scrollWidth - document.documentElement.clientWidth") <= 0
     finally:
         browser.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+@pytest.mark.parametrize("width", [400, 1400])
+def test_screenshots_of_the_whole_page(browsers, page, tmp_path, width):
+    """Kept where FINQD_SCREENSHOTS says, to be looked at."""
+    browser, folder = browsers(), Path(os.environ.get("FINQD_SCREENSHOTS") or tmp_path)
+    size = {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+    browser.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        browser.open(page)
+        height = browser.script("document.documentElement.scrollHeight")
+        browser.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {**size, "height": height})
+        browser.colours_of_the_view()  # waits for what is drawn anew
+        taken = browser.driver.execute_cdp_cmd("Page.captureScreenshot", {"format": "png"})["data"]
+    finally:
+        browser.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"report_{width}.png").write_bytes(base64.b64decode(taken))
+    picture = imread(folder / f"report_{width}.png")
+    assert picture.shape[:2] == (height, width)
+    ground = picture[0, 0, :3]
+    drawn = np.abs(picture[..., :3] - ground).max(axis=2) > 0.02
+    assert np.all(drawn.reshape(-1)[: 10 * (drawn.size // 10)].reshape(10, -1).any(axis=1))  # no tenth of it is empty
 
 
 @pytest.mark.parametrize("kind", ["empty", "all failed", "one", "without shapes", "one axis", "three axes"])

@@ -151,8 +151,8 @@ function objectTable(d) {
       "verdict",
       { text: "drop [mm]", number: true },
       { text: "margin", number: true },
-      { text: "force [N]", number: true },
-      { text: "penetration [mm]", number: true },
+      { text: "peak force on a finger [N]", number: true },
+      { text: "deepest penetration [mm]", number: true },
     ],
     rows,
   );
