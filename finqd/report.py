@@ -21,7 +21,7 @@ from finqd.design import Design
 from finqd.errors import FinqdError, InputError
 from finqd.labels import name_and_unit
 from finqd.report_benchmark import benchmark_of
-from finqd.report_facts import failures, object_failures, presets_of, settings_table, stated
+from finqd.report_facts import failures, object_failures, presets_of, screening_of, settings_table, stated
 from finqd.report_rechecks import rechecks_of
 from finqd.report_shapes import MAX_SHAPES, shapes_of
 from finqd.runlog import plain
@@ -54,12 +54,12 @@ def write_report(
 
 def report_data(run: Any, *, name: str, argument: str = "RUN", benchmark: Path | None = None) -> dict[str, Any]:
     """Return all that the page shows but the shapes: plain values, as JSON holds them, in the units of their keys."""
-    records, archive = run.records(), run.archive()
+    records, archive = _settled(run)
     elites = qd.elites(archive, records)
     objects = _objects(records)
     axes = _axes(run.ranges, archive.dims)
     volume = shown_volume(records, run.ranges)
-    front = pareto_front([r for r in records if r["status"] == "ok"], volume)
+    front = pareto_front([r for r in records if r["status"] == "ok" and _is_final(run, r)], volume)
     shown = _shown(archive, elites, front, run.ranges)
     designs = [_design_entry(run, record, cell, is_elite) for record, cell, is_elite in shown]
     compared = benchmark_of(run, benchmark, objects, archive)
@@ -74,7 +74,8 @@ def report_data(run: Any, *, name: str, argument: str = "RUN", benchmark: Path |
         "sensitivity": sensitivity(records, [path for path, _ in run.parameters]),
         "failures": failures(records), "object_failures": object_failures(records),
         "rechecks": rechecks_of(run),
-        "presets": presets_of(run, records), **stated(run, records, elites), "settings": settings_table(run.settings),
+        "presets": presets_of(run, records), "screening": screening_of(records), **stated(run, records, elites),
+        "settings": settings_table(run.settings),
         "colours": colour_stops(),
     })  # fmt: skip
 
@@ -153,6 +154,21 @@ def colour_stops() -> list[str]:
     from matplotlib.colors import to_hex
 
     return [to_hex(colormaps["viridis"](share)) for share in np.linspace(0.0, 1.0, 33)]
+
+
+def _settled(run: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
+    """Return records and archive that belong together, also while the search goes on between reading the two."""
+    while True:
+        records, archive = run.records(), run.archive()
+        known = {record["index"] for record in records}
+        if archive.empty or known.issuperset(archive.data("evaluation").tolist()):
+            return records, archive  # what was told since then, if anything, has changed nothing of the archive
+
+
+def _is_final(run: Any, record: Mapping[str, Any]) -> bool:
+    """Return whether a record is as exact as the run's results are; one that was only screened is not."""
+    confirm = run.settings.get("confirm")
+    return confirm is None or record.get("preset") in (None, confirm)
 
 
 def _axes(ranges: qd.Ranges, dims: Sequence[int]) -> list[dict[str, Any]]:

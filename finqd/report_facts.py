@@ -66,6 +66,25 @@ def presets_of(run: Any, records: Sequence[Mapping[str, Any]]) -> list[dict[str,
     return found
 
 
+def screening_of(records: Sequence[Mapping[str, Any]]) -> dict[str, int] | None:
+    """Return how often screening and confirmation disagree, or None if nothing was screened and confirmed.
+
+    confirmed: designs that have both; other_fitness: of these, those with another fitness; verdicts and flipped: of
+    single objects
+    """
+    both = [(r["screen"], r) for r in records if r.get("screen") and r["status"] == "ok" == r["screen"].get("status")]
+    if not both:
+        return None
+    pairs = [
+        (bool(row.get("held")), bool(final["objects"][name].get("held")))
+        for screen, final in both for name, row in screen["objects"].items() if name in final["objects"]
+    ]  # fmt: skip
+    return {
+        "confirmed": len(both), "other_fitness": sum(screen["fitness"] != final["fitness"] for screen, final in both),
+        "verdicts": len(pairs), "flipped": sum(before != after for before, after in pairs),
+    }
+
+
 def stated(run: Any, records: Sequence[Mapping[str, Any]], elites: Sequence[tuple]) -> dict[str, Any]:
     """Return assumptions, reductions and effects, as they hold for the designs of the run; how often each was met."""
     from finqd.report import design_of

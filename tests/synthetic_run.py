@@ -26,10 +26,12 @@ class SyntheticRun:
     base: dict[str, Any] = field(default_factory=dict)
     ranges: dict[str, tuple[float, float]] = field(default_factory=lambda: dict(RANGES))
     parameters: Any = PARAMETERS
+    confirm: str | None = None
 
     @property
     def settings(self):
-        return {"algorithm": "cma_me", "seed": 0, "batch": 15, "cells": self.cells, "preset": "standard"}
+        presets = {"screen": "draft", "confirm": self.confirm} if self.confirm else {"preset": "standard"}
+        return {"algorithm": "cma_me", "seed": 0, "batch": 15, "cells": self.cells, "objects": None, **presets}
 
     def records(self):
         return tuple(self.told)

@@ -143,6 +143,26 @@ def test_rechecks_are_summed_up_by_elite(tmp_path):
     assert found["raw"]["qd_score"] == pytest.approx(math.fsum(objectives))
 
 
+def test_screening_and_confirmation_are_compared_and_only_what_is_confirmed_is_on_the_front():
+    run = synthetic_run(20, cells=4)
+    ok = [record for record in run.told if record["status"] == "ok"]
+    for record in ok[::2]:
+        rows = {name: {**row, "held": not row["held"] if name == "cube" else row["held"]}
+                for name, row in record["objects"].items()}  # fmt: skip
+        record["screen"] = {"status": "ok", "fitness": record["fitness"] + 0.1, "objects": rows, "preset": "draft"}
+    for record in ok[1::2]:
+        record |= {"preset": "draft", "fitness": 1.0, "objective": 1e-3}  # only screened, and better than it is
+    run.confirm = "standard"
+    data = report_data(run, name="a")
+    n = len(ok[::2])
+    assert data["screening"] == {"confirmed": n, "other_fitness": n, "verdicts": 10 * n, "flipped": n}
+    assert set(data["pareto"]["front"]) <= {record["index"] for record in ok[::2]}
+    assert [(row["preset"], row["role"]) for row in data["presets"]] == [
+        ("draft", "screening"), ("standard", "confirmation")
+    ]
+    assert report_data(synthetic_run(3), name="a")["screening"] is None
+
+
 # sensitivity ----------------------------------------------------------------------------------------------------------
 
 

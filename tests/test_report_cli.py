@@ -7,30 +7,27 @@ import json
 import pytest
 from synthetic_run import synthetic_run
 
-import finqd.runlog
-from finqd.errors import InputError
+from finqd.runlog import RunLog
 
 PICTURES = ["heatmap", "coverage", "coverage_seconds", "qd_score", "qd_score_seconds", "pareto"]
 
 
 @pytest.fixture(scope="module")
 def searched():
-    return synthetic_run(24, cells=4)
+    return synthetic_run(24, cells=4, rechecked=0)
 
 
 @pytest.fixture
-def folder(searched, tmp_path, monkeypatch):
-    """A folder that reads as a run."""
+def folder(searched, tmp_path):
+    """A run with its log."""
     path = tmp_path / "first search"
-    path.mkdir()
-    (path / "run.sqlite").write_bytes(b"")
-
-    def read_run(asked):
-        if not (asked / "run.sqlite").exists():
-            raise InputError("is no run", str(asked))
-        return searched
-
-    monkeypatch.setattr(finqd.runlog, "read_run", read_run, raising=False)
+    log = RunLog.start(
+        path, settings=dict(searched.settings), base={}, parameters=searched.parameters, ranges=searched.ranges
+    )
+    with log:
+        for record in searched.records():
+            log.append(record)
+        log.note_told(len(searched.records()))
     return path
 
 
@@ -38,9 +35,11 @@ def data_of(page):
     return json.loads(page.read_text().split('id="data">')[1].split("</script>")[0])
 
 
-def test_the_page_goes_into_the_run_or_where_it_is_told(run, folder, tmp_path):
+def test_the_page_goes_into_the_run_or_where_it_is_told(run, folder, searched, tmp_path):
     assert run("report", folder) == (0, f"{folder / 'report.html'}\n", "")
     data = data_of(folder / "report.html")
+    assert data["summary"]["evaluations"] == 24 and data["summary"]["elites"] == len(searched.elites()) > 3
+    assert data["summary"]["qd_score"] == pytest.approx(searched.archive().stats.qd_score)
     assert data["name"] == "first search" and data["run_argument"] == f"'{folder}'"  # as a shell takes it
     target = tmp_path / "other.html"
     assert run("report", folder, "--out", target, "--shapes", "0")[0] == 0
@@ -70,7 +69,10 @@ def test_what_cannot_be_written_is_one_sentence(run, folder, tmp_path):
     (tmp_path / "file").write_text("")
     code, _, said = run("report", folder, "--png", tmp_path / "file")
     assert code == 2 and said.startswith("finqd: --png: cannot write to the folder") and said.count("\n") == 1
-    assert run("report", tmp_path)[2] == f"finqd: {tmp_path}: is no run\n"
+    assert run("report", tmp_path)[2] == f"finqd: {tmp_path}: holds no run: there is no run.sqlite in it\n"
+    (folder / "run.sqlite").write_bytes(b"no log" * 1000)
+    code, _, said = run("report", folder)
+    assert code == 2 and said.startswith(f"finqd: {folder / 'run.sqlite'}: ") and said.count("\n") == 1
 
 
 def test_the_shape_of_an_elite(run, folder, searched, tmp_path):
