@@ -54,7 +54,8 @@ def write_report(
 
 def report_data(run: Any, *, name: str, argument: str = "RUN", benchmark: Path | None = None) -> dict[str, Any]:
     """Return all that the page shows but the shapes: plain values, as JSON holds them, in the units of their keys."""
-    records, archive = _settled(run)
+    records = run.records()  # once: the search may go on meanwhile
+    archive = qd.rebuilt(records, len(run.parameters), run.ranges, cells=run.settings["cells"])
     elites = qd.elites(archive, records)
     objects = _objects(records)
     axes = _axes(run.ranges, archive.dims)
@@ -154,15 +155,6 @@ def colour_stops() -> list[str]:
     from matplotlib.colors import to_hex
 
     return [to_hex(colormaps["viridis"](share)) for share in np.linspace(0.0, 1.0, 33)]
-
-
-def _settled(run: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
-    """Return records and archive that belong together, also while the search goes on between reading the two."""
-    while True:
-        records, archive = run.records(), run.archive()
-        known = {record["index"] for record in records}
-        if archive.empty or known.issuperset(archive.data("evaluation").tolist()):
-            return records, archive  # what was told since then, if anything, has changed nothing of the archive
 
 
 def _is_final(run: Any, record: Mapping[str, Any]) -> bool:
