@@ -221,11 +221,12 @@ function drawFacts() {
         html("li", {}, html("b", {}, `${name.replaceAll("_", " ")}: `), text),
       ),
     );
-  document.const s = data.screening;
+  const s = data.screening;
   document.getElementById("screening").textContent = s
-    ? `${number(s.confirmed)} designs were screened and then confirmed: the fitness of ${number(s.other_fitness)} changed, and ${number(s.flipped)} of ${number(s.verdicts)} verdicts.`
+    ? `${number(s.confirmed)} designs were screened and then confirmed: the fitness of ${number(s.other_fitness)} ` +
+      `changed, and ${number(s.flipped)} of ${number(s.verdicts)} verdicts.`
     : "";
-  getElementById("preset-table").replaceChildren(
+  document.getElementById("preset-table").replaceChildren(
     data.presets.length
       ? table(
           ["preset", "used for", { text: "evaluations", number: true }, "measured accuracy"],
