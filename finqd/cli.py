@@ -19,6 +19,7 @@ import click
 from finqd import __version__
 from finqd.cli_accuracy import accuracy
 from finqd.cli_recheck import recheck
+from finqd.cli_report import export, report
 from finqd.cli_verify import verify
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, InputError
@@ -176,19 +177,6 @@ def optimise(
 
 
 @finqd.command()
-@click.argument("design")
-@click.option("--out", type=click.Path(path_type=Path), required=True,
-              help="A .stl or .step file, or a folder to hold both.")
-@_set_option
-def export(design: str, out: Path, settings: tuple[str, ...]) -> None:
-    """Write the gripper's shape, with its mount, for printing (STL) or CAD (STEP)."""
-    from finqd.export import export_gripper
-
-    for path in export_gripper(_read_design(design, settings), out):
-        click.echo(path)
-
-
-@finqd.command()
 @click.option("--geometry", default="fin_ray", show_default=True, metavar="NAME", help="Finger type of the designs.")
 def schema(geometry: str) -> None:
     """Print the JSON Schema of design files."""
@@ -261,6 +249,8 @@ def doctor() -> int:
 
 finqd.add_command(accuracy)
 finqd.add_command(recheck)
+finqd.add_command(export)
+finqd.add_command(report)
 finqd.add_command(verify)
 
 

@@ -39,10 +39,9 @@ def export_gripper(design: Design, out: str | os.PathLike[str]) -> list[Path]:
     paths = _targets(Path(out))
     geometry = design.plugin("geometry")
     solids = [geometry.build(design.finger_si(i)) for i in range(FINGERS)]
-    plate = next((f.plate_mm for f in design.plugin("features") if hasattr(f, "plate_mm")), _PLATE_MM)
     with gmsh_session() as gmsh:
         try:
-            _join(gmsh, _parts(gmsh, solids, design.spacing, plate * si_factor("plate_mm")))
+            _join(gmsh, _parts(gmsh, solids, design.spacing, _plate(design)))
             for path in paths:
                 _write(gmsh, path)
         except FinqdError:
@@ -50,6 +49,41 @@ def export_gripper(design: Design, out: str | os.PathLike[str]) -> list[Path]:
         except Exception as error:  # gmsh raises bare exceptions
             raise FinqdError(f"the gripper could not be exported: {' '.join(str(error).split())}") from error
     return paths
+
+
+def gripper_parts(design: Design) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return the closed surfaces that the export joins, as name, vertices (n, 3) [m] and outward triangles (m, 3).
+
+    They touch along whole faces, and pads and plate overlap. Raises ``InputError`` for inconsistent values.
+    """
+    geometry, plate = design.plugin("geometry"), _plate(design)
+    solids = [geometry.build(design.finger_si(i)) for i in range(FINGERS)]
+    ring = mount_plate(design.spacing)
+    parts = [("mount", *_raised(Prism(ring, (), plate).surface(), 0.5 * plate))]
+    for i, solid in enumerate(solids):
+        matrix, surface = placement(i, FINGERS, design.spacing), solid.surface()
+        low, high = _pad(surface[0], design.spacing)
+        cushion = _box(np.array([low[0], -plate, low[1]]), np.array([high[0], 0.0, high[1]]))
+        for name, (vertices, triangles) in (("finger", surface), ("mount", cushion)):
+            parts.append((name, vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles))
+    return parts
+
+
+def _box(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface of a box; bit k of a vertex's number says whether it lies high along axis k."""
+    bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+    sides = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6))
+    return np.where(bits, high, low), np.array([t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))])
+
+
+def _raised(surface: tuple[np.ndarray, np.ndarray], height: float) -> tuple[np.ndarray, np.ndarray]:
+    return surface[0] + np.array([0.0, 0.0, height]), surface[1]
+
+
+def _plate(design: Design) -> float:
+    """Return the thickness of the mount's plate [m]."""
+    plate = next((f.plate_mm for f in design.plugin("features") if hasattr(f, "plate_mm")), _PLATE_MM)
+    return plate * si_factor("plate_mm")
 
 
 def mount_plate(spacing: float) -> np.ndarray:
@@ -60,7 +94,10 @@ def mount_plate(spacing: float) -> np.ndarray:
 
 def pad(solid: Solid, spacing: float) -> np.ndarray:
     """Return the outline in the finger's x-z plane, (min, max) x (x, z) [m], of the pad on a finger's base."""
-    vertices, _ = solid.surface()
+    return _pad(solid.surface()[0], spacing)
+
+
+def _pad(vertices: np.ndarray, spacing: float) -> np.ndarray:
     base = vertices[np.abs(vertices[:, 1]) < 1e-8]
     low, high = base[:, [0, 2]].min(axis=0), base[:, [0, 2]].max(axis=0)
     low[0] -= min(0.5 * np.sqrt(3.0) * (high[1] - low[1]), spacing)

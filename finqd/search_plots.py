@@ -1,4 +1,4 @@
-"""Pictures of a search: the map as a heatmap, and coverage and QD score over the evaluations."""
+"""Pictures of a search: the map as a heatmap, coverage and QD score, and success against volume."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from finqd import archive as qd
-from finqd.units import unit_of
+from finqd.labels import label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from ribs.archives import GridArchive
 
 DPI = 160
+COVERAGE, QD_SCORE = "coverage [% of cells]", "QD score (sum of the cells' objectives)"
 INK, LINE, GRID = "#222222", "#1f6f8b", "#dddddd"
-UNIT_NAMES = {"mm2": "mm²", "mm3": "mm³", "m2": "m²", "m3": "m³", "deg": "°", "kg_m3": "kg/m³"}
 
 
 def draw(out: Path, archive: GridArchive, records: Sequence[qd.Record], ranges: qd.Ranges) -> None:
@@ -26,19 +26,27 @@ def draw(out: Path, archive: GridArchive, records: Sequence[qd.Record], ranges: 
     if len(ranges) <= 2:
         _heatmap(archive, records, ranges).savefig(out / "heatmap.png", dpi=DPI)
     coverage, score = qd.curves(archive, records, ranges)
-    _curve(100.0 * coverage, records, "coverage [% of cells]").savefig(out / "coverage.png", dpi=DPI)
-    _curve(score, records, "QD score (sum of the cells' objectives)").savefig(out / "qd_score.png", dpi=DPI)
+    _curve(100.0 * coverage, records, COVERAGE).savefig(out / "coverage.png", dpi=DPI)
+    _curve(score, records, QD_SCORE).savefig(out / "qd_score.png", dpi=DPI)
 
 
-def label(key: str) -> str:
-    """Return the axis label of a JSON key.
+def draw_for_paper(out: Path, run: Any) -> list[Path]:
+    """Write the pictures of a run as PNG files into ``out``, and return their paths.
 
-    >>> label("volume_mm3"), label("slenderness")
-    ('volume [mm³]', 'slenderness')
+    ``run``: as `finqd.runlog.read_run` returns it. Besides what `draw` writes: both curves over the seconds of
+    computing, and ``pareto.png``. No heatmap of a map with more than two axes.
     """
-    unit = next((u for u in UNIT_NAMES if key.endswith(f"_{u}")), unit_of(key))
-    name = key.removesuffix(f"_{unit}") if unit else key
-    return name.replace("_", " ") + (f" [{UNIT_NAMES.get(unit, unit)}]" if unit else "")
+    from finqd.report import elapsed, shown_volume
+
+    records, archive = run.records(), run.archive()
+    draw(out, archive, records, run.ranges)
+    coverage, score = qd.curves(archive, records, run.ranges)
+    seconds = np.array(elapsed(records))
+    for name, values, title in (("coverage", 100.0 * coverage, COVERAGE), ("qd_score", score, QD_SCORE)):
+        _curve(values, records, title, seconds=seconds).savefig(out / f"{name}_seconds.png", dpi=DPI)
+    _pareto(records, run.elites(), shown_volume(records, run.ranges)).savefig(out / "pareto.png", dpi=DPI)
+    names = ["coverage", "coverage_seconds", "qd_score", "qd_score_seconds", "pareto"]
+    return [out / f"{name}.png" for name in (["heatmap"] if len(run.ranges) <= 2 else []) + names]
 
 
 def _figure(width: float, height: float) -> tuple[Figure, Axes]:
@@ -90,21 +98,57 @@ def _write_numbers(axes: Axes, archive: GridArchive, found: Sequence[tuple[tuple
         )
 
 
-def _curve(values: np.ndarray, records: Sequence[qd.Record], ylabel: str) -> Figure:
-    """Draw a quantity over the number of evaluations, with the ends of the iterations marked."""
+def _curve(
+    values: np.ndarray, records: Sequence[qd.Record], ylabel: str, *, seconds: np.ndarray | None = None
+) -> Figure:
+    """Draw a quantity over the number of evaluations, or over ``seconds``, with the ends of the iterations marked."""
     from matplotlib.ticker import MaxNLocator
 
     figure, axes = _figure(7.2, 4.2)
-    axes.step([0, *range(1, len(values) + 1)], [0.0, *values], where="post", color=LINE, linewidth=1.8)
+    across = np.arange(1, len(values) + 1) if seconds is None else seconds
+    axes.step([0, *across], [0.0, *values], where="post", color=LINE, linewidth=1.8)
     iterations = np.array([record["iteration"] for record in records])
-    ends = np.flatnonzero(np.diff(iterations, append=-1)) + 1
-    axes.plot(ends, values[ends - 1], "o", color=LINE, markersize=4, clip_on=False, label="end of an iteration")
-    axes.set(xlabel="evaluations", ylabel=ylabel, xlim=(0, max(len(values), 1)))
+    ends = np.flatnonzero(np.diff(iterations, append=-1))
+    if len(ends) <= 40:
+        axes.plot(across[ends], values[ends], "o", color=LINE, markersize=4, clip_on=False, label="end of an iteration")
+    xlabel = "evaluations" if seconds is None else "computing time [s]"
+    axes.set(xlabel=xlabel, ylabel=ylabel, xlim=(0, max(across[-1] if len(across) else 1, 1)))
     axes.set_ylim(bottom=0.0)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if seconds is None:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _plain(axes)
+    if 0 < len(ends) <= 40:
+        axes.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def _pareto(records: Sequence[qd.Record], elites: Sequence[tuple], volume: str) -> Figure:
+    """Draw fitness over volume: all designs, the elites, and the front, beyond which nothing holds more with less."""
+    from matplotlib.ticker import StrMethodFormatter
+
+    from finqd.report import pareto_front
+
+    figure, axes = _figure(7.2, 4.6)
+    ok = [record for record in records if record["status"] == "ok"]
+    front = pareto_front(ok, volume)
+    shown = (
+        ("all designs", ok, {"color": "#b9c2c9", "s": 12}),
+        ("elites", [record for _, record in elites], {"color": LINE, "s": 16}),
+        ("front", front, {"facecolor": "white", "edgecolor": INK, "s": 42, "zorder": 4}),
+    )
+    for name, some, style in shown:
+        points = [(r["features"][volume], r["fitness"]) for r in some if volume in r["features"]]
+        axes.scatter(*(zip(*points) if points else ((), ())), label=name, **style)
+    if front:
+        axes.step(*zip(*[(r["features"][volume], r["fitness"]) for r in front]), where="post", color=INK, linewidth=1.2)
+    axes.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    axes.set(xlabel=label(volume), ylabel="fitness (share of objects held)", ylim=(-0.03, 1.05))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
+    _plain(axes)
+    return figure
+
+
+def _plain(axes: Axes) -> None:
     axes.grid(color=GRID, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    if len(ends):
-        axes.legend(frameon=False, loc="lower right")
-    return figure

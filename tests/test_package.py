@@ -122,6 +122,8 @@ def test_the_wheel_holds_the_package_its_data_and_nothing_else(wheel_environment
     for folder in ("objects", "designs", "studies"):
         carried = {Path(name).name for name in names if name.startswith(f"finqd/bundled/{folder}/")}
         assert {path.name for path in (ROOT / folder).glob("*.json")} <= carried
+    pages = {path.name for path in (ROOT / "finqd" / "page").iterdir()}
+    assert pages == {Path(name).name for name in names if name.startswith("finqd/page/")} and "page.html" in pages
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.endswith((".nbi", ".nbc", ".pyc"))]
 
