@@ -185,6 +185,18 @@ def elites(archive: GridArchive, records: Sequence[Record]) -> list[tuple[tuple[
     return [(tuple(map(int, cell)), by_index[int(e)]) for cell, e in zip(cells, data["evaluation"][order])]
 
 
+def entered(archive: GridArchive, records: Sequence[Record], ranges: Ranges) -> list[int]:
+    """Return the indices of the records that entered the archive when they were told, elites still or not."""
+    best: dict[int, float] = {}
+    found = []
+    for record in records:
+        cell = int(archive.index_of_single(_measures(record, ranges)))
+        if record["objective"] > best.get(cell, THRESHOLD_MIN):
+            best[cell] = record["objective"]
+            found.append(record["index"])
+    return found
+
+
 def elite_indices(archive: GridArchive) -> list[int]:
     """Return the indices of the records that are elites."""
     return [] if archive.empty else [int(index) for index in archive.data("evaluation")]

@@ -20,6 +20,7 @@ from finqd import __version__
 from finqd.cli_accuracy import accuracy
 from finqd.cli_recheck import recheck
 from finqd.cli_report import export, report
+from finqd.cli_search import log, optimise
 from finqd.cli_verify import verify
 from finqd.contracts import KINDS
 from finqd.errors import FinqdError, InputError
@@ -149,34 +150,6 @@ def explain(
 
 
 @finqd.command()
-@click.option("--iterations", type=click.IntRange(1), default=5, show_default=True, help="Rounds of the search.")
-@click.option("--batch", type=click.IntRange(1), default=15, show_default=True, help="Designs a round.")
-@_objects_option
-@_jobs_option
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the search.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR",
-              help="Folder for log, archive and pictures.")
-@_preset_option
-@click.option("--design", metavar="DESIGN", help="Where protocol, plugins and material are taken from.")
-def optimise(
-    iterations: int, batch: int, object_names: tuple[str, ...], jobs: int, seed: int, out: Path, preset: str,
-    design: str | None,
-) -> None:
-    """Search the design space for a map of different good grippers."""
-    from finqd.cli_progress import shown_progress
-    from finqd.cli_tables import print_search
-    from finqd.search import optimise as run
-
-    base = None if design is None else _read_design(design)
-    with shown_progress() as progress:
-        result = run(
-            iterations=iterations, batch=batch, objects=_split(object_names) or None, jobs=jobs, seed=seed, out=out,
-            preset=preset, base_design=base, progress=progress,
-        )
-    print_search(result)
-
-
-@finqd.command()
 @click.option("--geometry", default="fin_ray", show_default=True, metavar="NAME", help="Finger type of the designs.")
 def schema(geometry: str) -> None:
     """Print the JSON Schema of design files."""
@@ -251,6 +224,8 @@ finqd.add_command(accuracy)
 finqd.add_command(recheck)
 finqd.add_command(export)
 finqd.add_command(report)
+finqd.add_command(optimise)
+finqd.add_command(log)
 finqd.add_command(verify)
 
 

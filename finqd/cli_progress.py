@@ -5,8 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from finqd.search_progress import Standing
 
 Progress = Callable[[str, float], None]
 
@@ -50,3 +54,27 @@ def _lines() -> Progress:
             click.echo(f"{name}: done", err=True)
 
     return show
+
+
+@contextmanager
+def shown_standing(*, quiet: bool = False) -> Iterator[Callable[[Standing], None]]:
+    """Return a function that shows where a search stands: a line that changes on a terminal, lines elsewhere."""
+    if quiet:
+        yield lambda standing: None
+        return
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.live import Live
+
+        with Live(console=Console(stderr=True), transient=True, refresh_per_second=4) as live:
+            yield lambda standing: live.update(standing.sentence())
+        return
+    shown = -1
+
+    def show(standing: Standing) -> None:
+        nonlocal shown
+        if standing.evaluations != shown:
+            shown = standing.evaluations
+            click.echo(standing.sentence(), err=True)
+
+    yield show

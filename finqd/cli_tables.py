@@ -189,6 +189,8 @@ def print_search(result: SearchResult) -> None:
     failed = sum(record.get("status") != "ok" for record in result.records)
     counts = f"{len(result.records)} designs evaluated, {failed} failed, {len(elites)} elites"
     console.print(f"{counts}; everything is in {escape(str(result.out))}", soft_wrap=True)
+    if result.agreement is not None:
+        console.print(escape(result.agreement.sentence()), soft_wrap=True)
 
 
 def print_plugins(kind: str | None) -> None:

@@ -113,6 +113,10 @@ class Design:
 
     def digest(self) -> str:
         """Return a hash (SHA-256, hex) of all that is simulated: of `resolved`, without name and description."""
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
         content = {key: value for key, value in self.resolved().items() if key not in TEXTS}
         content["protocol"] = {key: value for key, value in content["protocol"].items() if value or key not in LATER}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -244,7 +248,7 @@ class Design:
 
     def spec(self, kind: str) -> Any:
         """Return name and set options of the plugin of a kind, ``{"name": ...}``; for features a list of them."""
-        spec: Any = self.to_dict().get(kind, DEFAULT_PLUGINS.get(kind))
+        spec: Any = json.loads(json.dumps(self.document.get(kind, DEFAULT_PLUGINS.get(kind)), default=dict))
         return [_named(one) for one in spec] if kind == "features" else _named(spec)
 
     def plugin(self, kind: str) -> Any:

@@ -22,6 +22,7 @@ from finqd import archive as qd
 from finqd.algorithms import ALGORITHMS, new_scheduler, reflected
 from finqd.design import Design, design_parameters
 from finqd.errors import InputError
+from finqd.fidelity import Agreement, agreement
 from finqd.runlog import Record, Run, RunLog, begun, read_run
 from finqd.search_evaluate import Evaluations, evaluated, run_twice
 from finqd.search_files import write_derived
@@ -70,6 +71,13 @@ class SearchResult:
         return self.run.records()
 
     @property
+    def agreement(self) -> Agreement | None:
+        """How often screening and confirmation disagree, None without screening."""
+        if self.run.settings["screen"] is None:
+            return None
+        return agreement(self.records, qd.entered(self.archive, self.records, self.ranges))
+
+    @property
     def elites(self) -> list[tuple[tuple[int, ...], qd.Record]]:
         """Grid cell and record of each elite."""
         return qd.elites(self.archive, self.records)
@@ -105,7 +113,7 @@ def optimise(
     began with other settings (``iterations`` may grow) or that another process writes to, and a full disk. Ctrl-C ends
     the workers, leaves the log with all that finished, and is raised again.
     """
-    presets = {"preset": preset, "screen": screen}
+    presets: dict[str, Any] = {"preset": preset, "screen": screen}
     check_options(
         algorithm=algorithm, objects=objects, presets=presets, ranges=ranges, iterations=iterations, batch=batch,
         seed=seed, cells=cells,
@@ -260,7 +268,7 @@ class _Search:
                 text = f"cannot go on: its algorithm asks for another design as evaluation {first + i} than it did"
                 raise InputError(f"{text} when that was evaluated, so ribs or NumPy differ", str(self.log.run.folder))
         units = np.array([logged.get(first + i, unit) for i, unit in enumerate(asked)])
-        self.scheduler._cur_solutions = units  # what is told is what was evaluated; there is no public way to say so
+        self.scheduler._cur_solutions = units  # type: ignore[assignment]  # what is told is what was evaluated; there is no public way to say so
         return {first + i: unit for i, unit in enumerate(units)}
 
     def tell(self, batch: list[Record]) -> None:

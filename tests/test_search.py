@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from finqd import archive as qd
+from finqd.algorithms import new_scheduler
 from finqd.design import Design
 from finqd.errors import InputError, MissingLibraryError
-from finqd.algorithms import ALGORITHMS, new_scheduler
 from finqd.runlog import RunLog, read_run
 from finqd.search import optimise, reflected
 
