@@ -69,12 +69,13 @@ def shown_standing(*, quiet: bool = False) -> Iterator[Callable[[Standing], None
         with Live(console=Console(stderr=True), transient=True, refresh_per_second=4) as live:
             yield lambda standing: live.update(standing.sentence())
         return
-    shown = -1
+    shown: tuple[float, ...] = ()
 
     def show(standing: Standing) -> None:
         nonlocal shown
-        if standing.evaluations != shown:
-            shown = standing.evaluations
+        news = (standing.evaluations, standing.coverage, standing.qd_score)  # the map's only at an iteration's end
+        if news != shown:
+            shown = news
             click.echo(standing.sentence(), err=True)
 
     yield show
