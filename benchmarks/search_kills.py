@@ -2,7 +2,7 @@
 
     python benchmarks/search_kills.py [--kills 20] [--seed 0]
 
-A search of a stand-in that takes 0.1 s runs undisturbed first. Then the same search, with two worker processes, is
+A search of a stand-in that takes 0.2 s runs undisturbed first. Then the same search, with two worker processes, is
 killed (``kill -9``) and begun again until it has been killed so often: each time at a random moment between its start
 and 10 s later, in turn the driver and one of its workers. After each kill of the driver the log is read: all that had
 been told before, and every whole iteration before the last line of ``progress.log``, must be in it. In the end the
@@ -27,7 +27,7 @@ import stand_in
 
 from finqd.runlog import begun, read_run
 
-ITERATIONS, BATCH, SECONDS = 20, 20, 0.1
+ITERATIONS, BATCH, SECONDS = 30, 20, 0.2
 
 
 def evaluate(design: Any, **options: Any) -> stand_in.StandIn:
