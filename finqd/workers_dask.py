@@ -9,6 +9,7 @@ with its machine costs nothing but time: the scheduler gives what ran there to a
 
 from __future__ import annotations
 
+import gc
 import logging
 import multiprocessing
 import pickle
@@ -60,10 +61,10 @@ def open_dask(scheduler: str | None, *, jobs: int, patience_s: float = PATIENCE_
         cluster = distributed.LocalCluster(  # as threads: the evaluations are processes anyway
             n_workers=jobs, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", memory_limit=0,
         )
-        client = distributed.Client(cluster, set_as_default=False)
+        client = _connected(distributed, cluster)
         return Dask(client, where="the embedded cluster", cluster=cluster, patience_s=patience_s)
     try:
-        client = distributed.Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+        client = _connected(distributed, scheduler, timeout=CONNECT_S)
     except (OSError, TimeoutError) as error:
         raise WorkersError(
             f"no dask scheduler answers at {scheduler}; one is started with: dask scheduler (see docs/cluster.md)"
@@ -71,6 +72,22 @@ def open_dask(scheduler: str | None, *, jobs: int, patience_s: float = PATIENCE_
     except (ValueError, TypeError) as error:
         raise InputError(f"must be an address as tcp://host:8786, not {scheduler!r}", where="scheduler") from error
     return Dask(client, where=scheduler, patience_s=patience_s)
+
+
+def _connected(distributed: Any, address: Any, **options: Any) -> Client:
+    """Return a client of a scheduler or cluster.
+
+    A client that never connected is closed when it is collected as garbage; if that happens while another one starts,
+    in this thread, the first waits for a lock of the second, for ever. So garbage is collected before and after.
+    """
+    collects = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        return distributed.Client(address, set_as_default=False, **options)
+    finally:
+        if collects:
+            gc.enable()
 
 
 class Abandoned(Exception):
