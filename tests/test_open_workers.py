@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -231,6 +232,21 @@ def test_a_scheduler_that_does_not_answer(monkeypatch):
     assert str(error.value) == (
         "no dask scheduler answers at tcp://127.0.0.1:9; one is started with: dask scheduler (see docs/cluster.md)"
     )
+
+
+def test_no_garbage_is_collected_while_a_client_starts(monkeypatch):
+    """One that never connected ends in the collector, which waited for the one that was starting: for ever."""
+    distributed = pytest.importorskip("distributed")
+    seen = []
+
+    def client(*_, **options):
+        seen.append(gc.isenabled())
+        raise OSError("nobody there")
+
+    monkeypatch.setattr(distributed, "Client", client)
+    with pytest.raises(WorkersError), open_workers("dask", scheduler="tcp://127.0.0.1:9"):
+        pass
+    assert seen == [False] and gc.isenabled()
 
 
 def test_a_scheduler_without_workers(tmp_path):
