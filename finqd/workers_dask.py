@@ -16,8 +16,8 @@ import pickle
 import queue
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -58,13 +58,15 @@ def open_dask(scheduler: str | None, *, jobs: int, patience_s: float = PATIENCE_
     for name in ("distributed", "distributed.client", "distributed.core", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # they print tracebacks of what is one sentence here
     if scheduler is None:
-        cluster = distributed.LocalCluster(  # as threads: the evaluations are processes anyway
-            n_workers=jobs, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", memory_limit=0,
-        )
-        client = _connected(distributed, cluster)
+        with _no_garbage():
+            cluster = distributed.LocalCluster(  # as threads: the evaluations are processes anyway
+                n_workers=jobs, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", memory_limit=0,
+            )
+            client = distributed.Client(cluster, set_as_default=False)
         return Dask(client, where="the embedded cluster", cluster=cluster, patience_s=patience_s)
     try:
-        client = _connected(distributed, scheduler, timeout=CONNECT_S)
+        with _no_garbage():
+            client = distributed.Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError) as error:
         raise WorkersError(
             f"no dask scheduler answers at {scheduler}; one is started with: dask scheduler (see docs/cluster.md)"
@@ -74,17 +76,18 @@ def open_dask(scheduler: str | None, *, jobs: int, patience_s: float = PATIENCE_
     return Dask(client, where=scheduler, patience_s=patience_s)
 
 
-def _connected(distributed: Any, address: Any, **options: Any) -> Client:
-    """Return a client of a scheduler or cluster.
+@contextmanager
+def _no_garbage() -> Iterator[None]:
+    """Keep the collector from running: clients and clusters start and end in this.
 
-    A client that never connected is closed when it is collected as garbage; if that happens while another one starts,
-    in this thread, the first waits for a lock of the second, for ever. So garbage is collected before and after.
+    A client that never connected is closed when it is collected as garbage; if that happens while another one starts or
+    ends, in this thread, the first waits for a lock that the second holds, for ever. So garbage is collected before.
     """
     collects = gc.isenabled()
     gc.collect()
     gc.disable()
     try:
-        return distributed.Client(address, set_as_default=False, **options)
+        yield
     finally:
         if collects:
             gc.enable()
@@ -196,10 +199,11 @@ class Dask:
 
     def close(self) -> None:
         """Leave the scheduler; end the embedded cluster."""
-        with suppress(Exception):  # it may be gone already
-            self._client.close(timeout=CONNECT_S)
-        if self._cluster is not None:
-            self._cluster.close(timeout=CONNECT_S)
+        with _no_garbage():
+            with suppress(Exception):  # it may be gone already
+                self._client.close(timeout=CONNECT_S)
+            if self._cluster is not None:
+                self._cluster.close(timeout=CONNECT_S)
         _close_idle()
 
 
