@@ -181,7 +181,8 @@ def test_a_worker_that_died_while_idle_costs_nobody_an_attempt():
     with open_workers("processes", jobs=1) as workers:
         (pid,) = workers.run(own_number, [0])
         os.kill(pid, signal.SIGKILL)
-        assert wait_until(lambda: not running([pid]), 20)
+        (worker,) = workers._workers
+        assert wait_until(lambda: not worker.process.is_alive(), 20)  # its last thread, too
         assert workers.run(own_number, [0], on_retry=lambda *call: again.append(call)) != [pid]
     assert again == []
 
