@@ -123,18 +123,13 @@ def _check_damping(read: Mapping[str, Any], where: str) -> None:
 
 def read_number(parameter: Parameter, value: Any, where: str) -> float:
     """Return a parameter's value in JSON units; raise ``InputError`` unless it is a number in its allowed range."""
-    allowed = in_words(parameter_schema(parameter))
-    if value is _MISSING:
-        raise InputError(f"missing; must be {allowed}", where)
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise InputError(f"must be {allowed}, not {shown(value)}", where)
-    if not parameter.allowed_low <= value <= parameter.allowed_high:  # refuses NaN too, and takes ints of any size
-        raise InputError(f"must be {allowed}, not {shown(value)}", where)
-    if not parameter.integer:
-        return float(value) + 0.0  # -0.0 becomes 0.0: one spelling for each value
-    if value != int(value):
-        raise InputError(f"must be {allowed}, not {shown(value)}", where)
-    return int(value)
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    # the comparison refuses NaN too, and takes ints of any size
+    fits = number and parameter.allowed_low <= value <= parameter.allowed_high
+    if not fits or (parameter.integer and value != int(value)):
+        must = f"must be {in_words(parameter_schema(parameter))}"
+        raise InputError(f"missing; {must}" if value is _MISSING else f"{must}, not {shown(value)}", where)
+    return int(value) if parameter.integer else float(value) + 0.0  # -0.0 becomes 0.0: one spelling for each value
 
 
 def finger_si(parameters: Sequence[Parameter], finger: Mapping[str, float]) -> dict[str, float]:

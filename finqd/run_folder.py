@@ -45,7 +45,11 @@ def locked(folder: Path) -> IO[str]:
 
 def plain(value: Any) -> Any:
     """Return ``value`` as JSON knows it: numpy arrays and numbers, mappings and tuples made plain, non-finite null."""
-    if isinstance(value, Mapping):
+    if value is None or isinstance(value, (str, bool, int)):  # most of a record is
+        return value
+    if isinstance(value, float) and not isinstance(value, np.generic):
+        return value if math.isfinite(value) else None
+    if isinstance(value, (dict, Mapping)):
         return {str(key): plain(one) for key, one in value.items()}
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
@@ -53,10 +57,6 @@ def plain(value: Any) -> Any:
         return [plain(one) for one in value]
     if isinstance(value, np.generic):
         return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
     raise TypeError(f"a log holds plain values, not {type(value).__name__}")
 
 

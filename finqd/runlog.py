@@ -263,18 +263,20 @@ class RunLog:
             row = self._connection.execute("SELECT max(json_extract(record, '$.finished_at')) FROM evaluations")
             return row.fetchone()[0] or 0.0
 
-    def append(self, record: Mapping[str, Any]) -> None:
-        """Write one evaluation; numbers that JSON does not know (NaN, infinity) become null."""
-        kept = plain({key: value for key, value in record.items() if key not in ("versions", "screen")})
+    def append(self, record: Mapping[str, Any]) -> Record:
+        """Write one evaluation, and return it with plain values: numbers that JSON does not know become None."""
+        written = plain(record)
+        kept = {key: value for key, value in written.items() if key not in ("versions", "screen")}
         if isinstance(kept.get("parameters"), dict):
             kept["parameters"] = list(kept["parameters"].values())  # their paths are in the header
         columns = [kept.get(key) for key in ("design_digest", "status", "fitness", "margin", "objective", "seconds")]
         with _in_words(self._path), _transaction(self._connection):
             self._connection.execute(
                 "INSERT INTO evaluations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (kept["index"], kept["preset"], *columns, self._version_id(record.get("versions", {})),
+                (kept["index"], kept["preset"], *columns, self._version_id(written.get("versions", {})),
                  json.dumps(kept, allow_nan=False)),
             )  # fmt: skip
+        return written
 
     def append_recheck(self, row: Mapping[str, Any]) -> None:
         """Write one recheck of an elite; ``index`` is the evaluation's."""

@@ -19,7 +19,7 @@ from finqd.contracts import Parameter
 from finqd.data import bundled_names, objects_folder
 from finqd.design import Design
 from finqd.errors import InputError, MissingLibraryError
-from finqd.runlog import Record, RunLog, plain
+from finqd.runlog import Record, RunLog
 from finqd.workers import TaskFailure
 
 #: of an evaluation, what a repetition of its content has too
@@ -82,6 +82,8 @@ class Evaluations:
         *, empty: bool,
     ) -> None:
         """Evaluate one design of each group of equal ones, and note the result for all of them."""
+        if not groups:  # all found, as in most of a replay: no worker is asked, which would take longer than that
+            return
         refused: list[tuple[int, Any]] = []
 
         def on_result(k: int, result: Any) -> None:
@@ -94,7 +96,7 @@ class Evaluations:
             self.call, [(group[0][1], stage.preset) for group in groups], on_result=on_result,
             on_progress=lambda k, fraction: on_progress(groups[k][0][0], fraction),
         )
-        if len(groups) == len(refused) > 0:
+        if len(groups) == len(refused):
             raise refused[0][1].exception  # not one design could be tried: it is what the user gave that is wrong
         for k, result in refused:
             stage.keep_all(groups[k], result)
@@ -130,8 +132,7 @@ class _Stage:
             values = design.to_vector().tolist()
             record["parameters"] = {path: value for (path, _), value in zip(owner.parameters, values)}
             record["design_digest"] = design.digest()
-        record = plain({**record, **self._outcome(result)})
-        owner.log.append(record)
+        record = owner.log.append({**record, **self._outcome(result)})
         self.records[index] = record
         self.on_record(record)
 
