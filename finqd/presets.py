@@ -31,11 +31,21 @@ _RELAXED: dict[str, Any] = {
     "implicit_euler": {"tolerance_share": 2e-4, "stall_iterations": 10, "contact_curvature": False},
 }
 
+#: Contact no sharper than a coarse mesh deserves. In ten grasps of the benchmark gripper fingers press within 3 % of what
+#: they do with the contact's own defaults, and drops change by 0.2 mm at most, 0.1 mm in nine; a grasp takes 0.7 of the
+#: time, and half of it with two random designs, where contact takes more iterations
+_SOFT: dict[str, Any] = {
+    "penalty": {
+        "stiffness_N_mm3": 100.0, "smoothing_mm": 0.03, "friction_stiffness_ratio": 0.1, "sample_spacing_mm": 0.6,
+    },
+}  # fmt: skip
+
 #: preset -> section -> options by plugin, of which the preset chooses the first; the protocol has no plugin
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "mesher": {"swept": {"size_mm": 4.0, "layers": 1, **_QUARTER}, "tetrahedral": {"size_mm": 6.0}},
-        "stepper": _RELAXED,
+        "contact": _SOFT,
+        "stepper": {"implicit_euler": {**_RELAXED["implicit_euler"], "tolerance_share": 1e-3}},
         "protocol": {"time_step_ms": 20.0, "calm_step_factor": 4},
     },
     # 20 ms: forces of five grasps of the benchmark gripper within 0.6 %, drops within 0.02 mm of those at 10 ms
