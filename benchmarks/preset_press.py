@@ -105,13 +105,17 @@ def report_rows(rows: dict[tuple[str, str], Row], levels: list[str]) -> None:
 
 
 def write_bands(rows: dict[tuple[str, str], Row], levels: list[str]) -> None:
-    """Write the quantiles to studies/presets.json."""
+    """Write the quantiles to studies/presets.json, and the benchmark finger's error and the settings with them."""
     path = studies_folder() / "presets.json"
     document = json.loads(path.read_text())
     document["studies"]["press_fingers"] |= {"date": time.strftime("%Y-%m-%d"), "versions": versions()}
     for level in levels[1:]:
         found = np.abs(list(errors(rows, level).values()))
-        document["presets"][level] |= {"press_fingers_error_percent": round(float(np.percentile(found, QUANTILE)), 2)}
+        row, band = rows["benchmark", level], document["presets"][level]
+        if band["settings"] != PRESETS[level]:  # a preset that has changed since `preset_bands.py` wrote its row
+            off = 100.0 * abs(row["force_N"] / REFERENCE - 1.0)
+            band |= {"press_force_error_percent": round(off, 2), "settings": PRESETS[level]}
+        band |= {"press_fingers_error_percent": round(float(np.percentile(found, QUANTILE)), 2)}
     write_whole(path, json.dumps(document, indent=2) + "\n")
 
 
