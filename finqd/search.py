@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -24,11 +24,12 @@ from finqd.design import Design, design_parameters
 from finqd.errors import InputError
 from finqd.fidelity import Agreement, agreement
 from finqd.runlog import Record, Run, RunLog, begun, read_run
-from finqd.search_evaluate import Evaluations, evaluated, run_twice
+from finqd.search_evaluate import Evaluations, evaluated
 from finqd.search_files import write_derived
 from finqd.search_progress import Reporter, Standing
 from finqd.search_settings import check_options, check_ranges, refuse_changes, settings_of
-from finqd.workers import run_tasks
+from finqd.workers import Workers, open_workers
+from finqd.workers_task import check_limits
 
 if TYPE_CHECKING:
     from ribs.archives import GridArchive
@@ -87,7 +88,7 @@ def optimise(
     *, out: Path, algorithm: str = "cma_me", iterations: int = 5, batch: int = 15,
     objects: Sequence[Any] | None = None, jobs: int = 1, seed: int = 0, preset: str = "standard",
     screen: str | None = None, base_design: Design | None = None, evaluate: Evaluator | None = None, cells: int = 10,
-    ranges: qd.Ranges | None = None, time_limit_s: float | None = 3600.0, workers: Any = None,
+    ranges: qd.Ranges | None = None, time_limit_s: float | None = 3600.0, workers: Workers | None = None,
     other_versions: bool = False, progress: Progress | None = None, report: Callable[[Standing], None] | None = None,
 ) -> SearchResult:
     """Run ``iterations`` rounds of ``batch`` designs each, or what is left of them; return the archive.
@@ -103,8 +104,8 @@ def optimise(
     ranges: features to map and their ranges, in their units; by default the first feature of each feature plugin of
         the design, with the range that `finqd.archive.feature_ranges` finds
     time_limit_s: wall-clock seconds of one evaluation, None: as long as it takes; who takes longer has failed
-    workers: where evaluations run, with ``run(function, tasks, time_limit_s=, on_result=, on_progress=)``; by default
-        ``jobs`` processes (in this one with one job and no time limit)
+    workers: where evaluations run, see `finqd.workers.Workers`; by default ``jobs`` processes (in this one with one job
+        and no time limit)
     other_versions: go on with a run that was begun with other versions of finqd or its libraries
     progress: called as ``progress("iteration 1 of 5", fraction)``; report: called with a `Standing` after each design
 
@@ -118,18 +119,18 @@ def optimise(
         algorithm=algorithm, objects=objects, presets=presets, ranges=ranges, iterations=iterations, batch=batch,
         seed=seed, cells=cells,
     )  # fmt: skip
+    check_limits(time_limit_s=time_limit_s)
     call = partial(evaluated, evaluate=evaluate or _default_evaluator(), objects=objects)
-    if workers is None:
-        run_all = partial(run_twice, partial(run_tasks, jobs=jobs, time_limit_s=time_limit_s))
-    else:
-        run_all = partial(workers.run, time_limit_s=time_limit_s)
-    run_tasks(call, [], jobs=jobs, time_limit_s=time_limit_s)  # refuses its options before a file is written
     base = {} if base_design is None else {k: v for k, v in base_design.settings.items() if k != "name"}
     settings = partial(
         settings_of, base=base, objects=objects, algorithm=algorithm, seed=seed, iterations=iterations, batch=batch,
         cells=cells, limits={"time_limit_s": time_limit_s}, evaluate=call.keywords["evaluate"], **presets,
     )  # fmt: skip
-    with _log(Path(out), base, ranges, settings, other_versions=other_versions) as log:
+    kind = "inline" if jobs == 1 and time_limit_s is None else "processes"
+    with ExitStack() as stack:
+        mine = stack.enter_context(open_workers(kind, jobs=jobs)) if workers is None else workers
+        log = stack.enter_context(_log(Path(out), base, ranges, settings, other_versions=other_versions))
+        run_all = partial(mine.run, time_limit_s=time_limit_s)
         search = _Search.start(log, run_all=run_all, call=call, report=report)
         try:
             for iteration in range(iterations):

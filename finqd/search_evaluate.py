@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -33,7 +34,7 @@ Progress = Callable[[str, float], None]
 class Evaluations:
     """Evaluates designs of one run.
 
-    run_all: as `finqd.workers.run_tasks`; call: what evaluates a design, in a worker; features: on the map's axes;
+    run_all: as `finqd.workers.Workers.run`; call: what evaluates a design, in a worker; features: on the map's axes;
     clock: seconds of computing of this run; on_record: told of what was just written, ``on_record(record)``
     """
 
@@ -85,16 +86,18 @@ class Evaluations:
         if not groups:  # all found, as in most of a replay: no worker is asked, which would take longer than that
             return
         refused: list[tuple[int, Any]] = []
+        again = Counter[int]()
 
         def on_result(k: int, result: Any) -> None:
             if empty and isinstance(getattr(result, "exception", None), (InputError, MissingLibraryError)):
                 refused.append((k, result))
             else:
-                stage.keep_all(groups[k], result)
+                stage.keep_all(groups[k], result, attempts=1 + again[k])
 
         self.run_all(
             self.call, [(group[0][1], stage.preset) for group in groups], on_result=on_result,
             on_progress=lambda k, fraction: on_progress(groups[k][0][0], fraction),
+            on_retry=lambda k, _: again.update([k]),
         )
         if len(groups) == len(refused):
             raise refused[0][1].exception  # not one design could be tried: it is what the user gave that is wrong
@@ -113,19 +116,20 @@ class _Stage:
     on_record: Callable[[Record], None]
     records: dict[int, Record] = field(default_factory=dict)
 
-    def keep_all(self, group: Sequence[tuple[int, Design]], result: Any) -> None:
+    def keep_all(self, group: Sequence[tuple[int, Design]], result: Any, *, attempts: int = 1) -> None:
         """Note the result of equal designs: the first one's, and repetitions of it."""
-        self.keep(*group[0], result)
+        self.keep(*group[0], result, attempts=attempts)
         for index, design in group[1:]:
             self.keep(index, design, _repetition(self.records[group[0][0]]))
 
-    def keep(self, index: int, design: Design | TaskFailure, result: Any) -> None:
+    def keep(self, index: int, design: Design | TaskFailure, result: Any, *, attempts: int = 1) -> None:
         owner = self.owner
         record: Record = {
             "index": index, "iteration": self.iteration, "emitter": 0, "seed": owner.seed, "preset": self.preset,
             "unit": self.units[index].tolist(), "parameters": {}, "design_digest": None, "fitness": None,
             "margin": None, "objective": qd.PENALTY, "features": {}, "objects": {}, "accuracy": None, "seconds": None,
-            "reason": "", "details": "", "host": socket.gethostname(), "attempts": getattr(result, "attempts", 1),
+            "reason": "", "details": "", "host": socket.gethostname(),
+            "attempts": max(attempts, getattr(result, "attempts", 1)),
             "versions": dict(owner.versions), "finished_at": owner.clock(), "screen": None,
         }  # fmt: skip
         if isinstance(design, Design):
@@ -184,39 +188,3 @@ def evaluated(
     result = found.to_dict()
     record |= {"accuracy": result.get("accuracy", {}).get("sentence"), "objects": result.get("objects", {})}
     return {**record, "seconds": time.perf_counter() - begin, "host": socket.gethostname()}
-
-
-def run_twice(
-    run_all: Callable[..., Any], function: Callable[..., Any], tasks: Sequence[Any], *,
-    on_result: Callable[[int, Any], None], on_progress: Callable[[int, float], None],
-) -> None:
-    """Run tasks; those whose worker died run once more, since it may not have been their fault."""
-    died: list[int] = []
-
-    def first(k: int, result: Any) -> None:
-        if isinstance(result, TaskFailure) and result.kind == "crash":
-            died.append(k)
-        else:
-            on_result(k, result)
-
-    run_all(function, tasks, on_result=first, on_progress=on_progress)
-    if died:
-        run_all(
-            function, [tasks[k] for k in died], on_result=lambda j, result: on_result(died[j], _second(result)),
-            on_progress=lambda j, fraction: on_progress(died[j], fraction),
-        )
-
-
-def _second(result: Any) -> Any:
-    if isinstance(result, TaskFailure):
-        return _Again(kind=result.kind, reason=result.reason, details=result.details, exception=result.exception)
-    return {**result, "attempts": 2}
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Again(TaskFailure):
-    """A failure at the second attempt."""
-
-    attempts: int = 2
-
-
