@@ -8,7 +8,7 @@ operating system on RUN/run.lock keeps a second one out, and goes with the proce
 >>> folder = Path(tempfile.mkdtemp()) / "run"
 >>> settings = {"objects": None, "cells": 5, "preset": "draft"}
 >>> with RunLog.start(folder, settings=settings, base={}, parameters=(), ranges={"volume_mm3": (0.0, 1.0)}) as log:
-...     log.append({"index": 0, "preset": "draft", "status": "ok", "fitness": 0.9, "margin": float("nan")})
+...     _ = log.append({"index": 0, "preset": "draft", "status": "ok", "fitness": 0.9, "margin": float("nan")})
 ...     log.note_told(1)
 >>> [(record["index"], record["fitness"], record["margin"]) for record in read_run(folder).records()]
 [(0, 0.9, None)]

@@ -322,8 +322,10 @@ def test_presets_set_what_is_open_and_nothing_else(benchmark):
     own = {"size_mm": 3, "layers": 4, "order": 1, "notch_nodes": "middle"}
     stepper = {"name": "implicit_euler", "tolerance_share": 1e-4, "stall_iterations": 7,
                "contact_curvature": True}
+    contact = {"name": "penalty", "stiffness_N_mm3": 200.0, "smoothing_mm": 0.02, "friction_stiffness_ratio": 0.3,
+               "sample_spacing_mm": 0.4}
     explicit = benchmark.with_overrides(
-        {"mesher": {"name": "swept", **own}, "stepper": stepper, "protocol.time_step_ms": 7,
+        {"mesher": {"name": "swept", **own}, "stepper": stepper, "contact": contact, "protocol.time_step_ms": 7,
          "protocol.calm_step_factor": 1})
     assert apply_preset(explicit, "draft").digest() == explicit.digest()
     other = apply_preset(benchmark.with_overrides({"mesher": "tetrahedral"}), "draft")

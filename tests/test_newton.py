@@ -164,3 +164,40 @@ def test_an_iteration_begins_with_the_projected_matrix_after_one_that_needed_it(
     assert order[0] == [False, True] and order[1] == [True], "only the projected one led downhill"
     assert order[-1] == [False] and abs(at.x - 1.0) < 1e-9, "exact again, and quadratic, at the end"
     assert report.projections == sum(sum(one) for one in order)
+
+
+@pytest.mark.parametrize("adaptive", [True, False])
+def test_a_matrix_that_lacks_the_contacts_curvature_is_not_used_again_where_it_led_too_far(
+    adaptive: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A parabola of which the matrix has an eighth without the contact's curvature: then each search ends short."""
+    if not adaptive:  # the wrong twin
+        monkeypatch.setattr(newton, "SHORT", newton.HALVINGS + 1)
+    derivatives = SimpleNamespace(soft=np.zeros(1), rigid=np.zeros(0))
+    without: list[bool] = []
+
+    class Bowl(Newton):
+        def _solve(self) -> Any:
+            return SimpleNamespace(soft=-derivatives.soft / derivatives.curvature, rigid=np.zeros(0), definite=True)
+
+    def gradient(at: SimpleNamespace) -> float:
+        derivatives.soft = np.array([at.x])
+        return float(0.5 * at.x**2)
+
+    def hessian(at: SimpleNamespace, *, projected: bool, contact_projected: bool) -> None:
+        without.append(contact_projected)
+        derivatives.curvature = 0.125 if contact_projected else 1.0
+
+    def state(x: float) -> SimpleNamespace:
+        return SimpleNamespace(x=x, moved=lambda direction, share=1.0: state(x + share * direction.soft[0]))
+
+    contact = SimpleNamespace(step_limit=lambda *_: 0.7)
+    system = SimpleNamespace(lightest_weight=np.inf, derivatives=derivatives, contact=contact)
+    increment, report = SimpleNamespace(gradient=gradient, hessian=hessian, scale=1.0), StepReport(residuals=[])
+    bowl = Bowl(system=system, increment=increment, options=NewtonOptions(contact_curvature=False), report=report)
+    at = state(1.0)
+    for _ in range(3):
+        moved = bowl._iterate(at, gradient(at))
+        assert moved is not None
+        at = moved[0]
+    assert without == ([True, False, True] if adaptive else [True, True, True])

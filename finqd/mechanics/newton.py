@@ -34,6 +34,7 @@ NEARER = 0.3  # share of the residual by which an iteration must get on for the 
 PROJECTED = 3  # iterations after which it is in any case: by projected ones Newton converges linearly
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
 BLURRED = 1e-6  # relative rise of an energy that may be rounding, if the slope along the step falls to
+SHORT = 2  # halvings of a line search that tell that the matrix lacks curvature there
 FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and Zhang, SIAM J. Optim. 16 (2005) 170).
 
 
@@ -49,8 +50,9 @@ class NewtonOptions:
     max_iterations: Newton iterations after which a step is given up (and halved); as many more for each renewal.
         Quasi-Newton steps are not counted
     stall_iterations: iterations that do not halve the residual after which a step is given up as well; None: none
-    contact_curvature: whether the matrix has what contact adds by its curvature. That jumps where points come to edges:
-        where bodies slide over edges there are a fifth fewer iterations without
+    contact_curvature: whether the matrix always has what contact adds by its curvature. That jumps where points come to
+        edges: where bodies slide over edges there are a fifth fewer iterations without; then only the iteration after a
+        line search of `SHORT` halvings has it, as where edges of fingers rest on each other nothing converges without
     max_friction_updates: how often the friction bounds are renewed within a step
     friction_tolerance: share of the friction bounds that may change without a renewal
     linear_solver, preconditioner, backend: see `finqd.mechanics.linear`
@@ -121,11 +123,13 @@ class _Convexity:
     """Which matrix an iteration begins with: the exact one, unless the one before found no descent by that.
 
     lost: whether it did not; residual: before it [N]; row: how many have begun with the projected one since
+    short: whether the last line search was (see `SHORT`)
     """
 
     lost: bool = False
     residual: float = np.inf
     row: int = 0
+    short: bool = False
 
     def tries(self, residual: float) -> tuple[bool, bool]:
         """Return in which order matrices are tried from a state with ``residual`` [N]: whether projected."""
@@ -310,13 +314,15 @@ class Newton:
                 self.increment.gradient(trial)
             convexity.lost = projected
             report.projections += int(projected)
-            plain = not self.options.contact_curvature
+            plain = not (self.options.contact_curvature or convexity.short)
             self.increment.hessian(trial, projected=projected, contact_projected=plain)
             solution = self._solve()
             direction = Direction(soft=solution.soft, rigid=solution.rigid)
             slope = self._slope(direction)
             if solution.definite and slope < 0.0:
+                halvings = report.line_searches
                 moved = self._search(trial, energy, direction, slope)
+                convexity.short = report.line_searches >= halvings + SHORT
                 if moved is not None:
                     return moved
         report.reason = f"the line search found no descent: {report.residual:.3g} N left on {report.where}"
