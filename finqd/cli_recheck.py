@@ -39,10 +39,11 @@ def worker_options(command: Any) -> Any:
 @click.option("--vary", multiple=True, metavar="NAME=LOW:HIGH|NAME=off",
               help="Another range of one quantity, or leave it as it is; may be repeated.")
 @worker_options
+@click.option("--other-versions", is_flag=True, help="Go on though finqd or its libraries were others in the search.")
 @click.option("--quiet", is_flag=True, help="Print nothing but what goes wrong.")
 def recheck(
     run: Path, count: int, seed: int, vary: tuple[str, ...], kind: str | None, jobs: int | None,
-    scheduler: str | None, time_limit_s: float, quiet: bool,
+    scheduler: str | None, time_limit_s: float, other_versions: bool, quiet: bool,
 ) -> None:
     """Evaluate the elites of a search again, under other conditions, and say how far its map is to be trusted.
 
@@ -58,7 +59,7 @@ def recheck(
 
         found = start(
             run, count=count, scheme=scheme, kind=kind or ("dask" if scheduler else "processes"), jobs=jobs,
-            scheduler=scheduler, time_limit_s=time_limit_s, progress=progress,
+            scheduler=scheduler, time_limit_s=time_limit_s, progress=progress, other_versions=other_versions,
         )
     if not quiet:
         print_trust(found)

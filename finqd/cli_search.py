@@ -82,16 +82,19 @@ def optimise(run: Path | None, quiet: bool, other_versions: bool, **options: Any
     if not quiet:
         print_search(result)
     if given.get("recheck"):
-        _recheck(out, given["recheck"], where, search["time_limit_s"], quiet=quiet)
+        _recheck(
+            out, given["recheck"], where, time_limit_s=search["time_limit_s"], other_versions=other_versions,
+            quiet=quiet,
+        )
 
 
-def _recheck(out: Path, count: int, where: dict[str, Any], time_limit_s: float, *, quiet: bool) -> None:
+def _recheck(out: Path, count: int, where: dict[str, Any], *, quiet: bool, **options: Any) -> None:
     from finqd.cli_progress import shown_progress
     from finqd.cli_recheck import print_trust
     from finqd.recheck import recheck
 
     with shown_progress(quiet=quiet) as progress:
-        found = recheck(out, count=count, **where, time_limit_s=time_limit_s, progress=progress)
+        found = recheck(out, count=count, **where, **options, progress=progress)
     if not quiet:
         print_trust(found)
 

@@ -57,18 +57,23 @@ class _Task:
 def recheck(
     folder: Path, *, count: int, scheme: Scheme | None = None, kind: str = "processes", jobs: int | None = None,
     scheduler: str | None = None, time_limit_s: float | None = 3600.0, evaluate: Callable[..., Any] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | None = None, other_versions: bool = False,
 ) -> Trust:
     """Recheck the run in a folder, see `recheck_run`; write what that says to ``recheck.json`` beside its log.
 
     kind, jobs, scheduler: where evaluations run, see `finqd.workers.open_workers`; evaluate: as for a search
+    other_versions: compare with results of other versions of finqd or its libraries
+
+    Raises InputError as that does, and for objects or versions that are others than when the run began.
     """
     from finqd.runlog import RunLog, read_run
     from finqd.search_evaluate import evaluated
+    from finqd.search_settings import refuse_other_world
 
     if evaluate is None:
         from finqd.evaluate import evaluate
     run = read_run(folder)
+    refuse_other_world(run.settings, run.base, other_versions=other_versions, where=str(folder))
     call = partial(evaluated, evaluate=evaluate, objects=run.settings["objects"])
     with open_workers(kind, jobs=jobs, scheduler=scheduler) as workers, RunLog(folder) as log:
         found = recheck_run(

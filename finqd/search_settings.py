@@ -111,6 +111,20 @@ def refuse_changes(old: Mapping[str, Any], new: Mapping[str, Any], *, other_vers
         raise InputError(text, where=where)
 
 
+def refuse_other_world(
+    settings: Mapping[str, Any], base: Mapping[str, Any], *, other_versions: bool, where: str
+) -> None:
+    """Raise ``InputError`` if what a run's results depend on beside its settings, objects and versions, has changed."""
+    from finqd.evaluate import load_objects
+
+    objects = settings["objects"]
+    if objects is not None:
+        load_objects(objects)  # one whose file is gone is told of in words
+    now = {"objects_digest": _objects_digest(objects), "versions": versions_of(base)}
+    old = {key: settings[key] for key in now if key in settings}
+    refuse_changes(old, {key: plain(now[key]) for key in old}, other_versions=other_versions, where=where)
+
+
 def versions_of(base: Mapping[str, Any]) -> dict[str, str]:
     """Return the versions that a result of this run depends on: finqd, its libraries, who brought the plugins."""
     from finqd.design_schema import DEFAULT_PLUGINS

@@ -23,6 +23,7 @@ from finqd.provenance import versions
 from finqd.recheck import recheck, recheck_run, trust_of
 from finqd.run_folder import plain
 from finqd.runlog import RunLog, read_run
+from finqd.search_settings import versions_of
 from finqd.trust import Share
 from finqd.workers import open_workers
 
@@ -281,6 +282,29 @@ def test_a_folder_that_is_stopped_goes_on_to_the_same_rows(folder, tmp_path):
 def test_nominal_conditions_are_found_in_the_log_of_the_search(folder):
     found = recheck(folder, count=2, kind="inline", evaluate=None, scheme=Scheme(ranges=NOTHING))
     assert found.complete and found.corrected == found.raw and len(read_run(folder).rechecks()) == 4
+
+
+@pytest.mark.parametrize(
+    ("changed", "options", "sentence"),
+    [
+        ({"objects_digest": "0123456789abcdef"}, ["--other-versions"],
+         "objects_digest was \"0123456789abcdef\" when this run began, and is "),
+        ({"versions": {**versions_of(BASE), "numpy": "1.0"}}, [], 'versions.numpy was "1.0" when this run began, and is '),
+        ({"versions": {**versions_of(BASE), "numpy": "1.0"}}, ["--other-versions"], ""),
+    ],
+)  # fmt: skip
+def test_what_was_searched_with_other_objects_or_versions_is_not_compared(
+    folder, monkeypatch, changed, options, sentence
+):
+    monkeypatch.setattr("finqd.evaluate.evaluate", evaluate)
+    with RunLog(folder) as log:
+        log.change_settings({**log.run.settings, **changed})
+    done = CliRunner().invoke(recheck_command, [str(folder), "-k", "1", "--workers", "inline", *options])
+    rows = len(read_run(folder).rechecks())
+    if sentence:
+        assert isinstance(done.exception, InputError) and sentence in str(done.exception) and rows == 0
+    else:
+        assert done.exit_code == 0 and rows == 2, done.output
 
 
 def test_the_command_says_what_came_of_it(folder, monkeypatch):
