@@ -289,7 +289,8 @@ def test_nominal_conditions_are_found_in_the_log_of_the_search(folder):
     [
         ({"objects_digest": "0123456789abcdef"}, ["--other-versions"],
          "objects_digest was \"0123456789abcdef\" when this run began, and is "),
-        ({"versions": {**versions_of(BASE), "numpy": "1.0"}}, [], 'versions.numpy was "1.0" when this run began, and is '),
+        ({"versions": {**versions_of(BASE), "numpy": "1.0"}}, [],
+         'versions.numpy was "1.0" when this run began, and is '),
         ({"versions": {**versions_of(BASE), "numpy": "1.0"}}, ["--other-versions"], ""),
     ],
 )  # fmt: skip
