@@ -39,6 +39,19 @@ def test_its_own_suite_runs_the_conformance_checks_on_it_alone(example_environme
     assert "fin_ray" not in done.stdout and " passed" in done.stdout
 
 
+def test_the_installed_wheel_evaluates_from_an_empty_folder(wheel_environment, tmp_path):
+    """Here, and not beside the package's other tests: both evaluations then load what one of them has compiled."""
+    done = wheel_environment.run(
+        "finqd", "evaluate", "benchmark", "--objects", "sphere", "--preset", "draft", "--out", "result.json",
+        cwd=tmp_path,
+    )
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["objects"]["sphere"]["status"] == "ok", result["objects"]
+    assert abs(result["features"]["workspace_mm2"] - 2078.46) < 0.01
+    assert "sphere" in done.stdout and "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
+
+
 def test_its_design_is_evaluated(example_environment, tmp_path):
     design = tmp_path / "tapered.json"
     shutil.copy(EXAMPLE / "designs" / "tapered.json", design)

@@ -141,15 +141,3 @@ def test_the_installed_wheel_is_what_runs_and_knows_its_objects_and_designs(whee
     listed = wheel_environment.run("python", "-m", "finqd", "plugins", cwd=tmp_path).stdout
     assert all(f"{entry.kind} {entry.name}" in listed for entry in registry.entries())
     assert not list(tmp_path.iterdir()), "a command that only shows something wrote a file"
-
-
-def test_the_installed_wheel_evaluates_from_an_empty_folder(wheel_environment, tmp_path):
-    done = wheel_environment.run(
-        "finqd", "evaluate", "benchmark", "--objects", "sphere", "--preset", "draft", "--out", "result.json",
-        cwd=tmp_path,
-    )
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["objects"]["sphere"]["status"] == "ok", result["objects"]
-    assert abs(result["features"]["workspace_mm2"] - 2078.46) < 0.01
-    assert "sphere" in done.stdout and "Traceback" not in done.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
