@@ -33,7 +33,7 @@ _RELAXED: dict[str, Any] = {
 
 #: Contact no sharper than a coarse mesh deserves. In ten grasps of the benchmark gripper fingers press within 3 % of
 #: what they do with the contact's own defaults, and drops change by 0.2 mm at most, 0.11 mm in nine; a grasp takes 0.7
-#: of the time. In 22 grasps of the fuzz 28 % fewer iterations, each of them cheaper, and the same verdicts
+#: of the time. In 22 grasps of the fuzz 28 % fewer iterations, and the same verdicts
 _SOFT: dict[str, Any] = {
     "penalty": {
         "stiffness_N_mm3": 100.0, "smoothing_mm": 0.03, "friction_stiffness_ratio": 0.1, "sample_spacing_mm": 0.6,

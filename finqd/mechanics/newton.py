@@ -33,8 +33,8 @@ WORTHWHILE = 0.5  # share of the lowest residual so far that counts as progress
 NEARER = 0.3  # share of the residual by which an iteration must get on for the exact matrix to be tried again
 PROJECTED = 3  # iterations after which it is in any case: by projected ones Newton converges linearly
 ROUNDING = 1e-12  # relative accuracy of an energy, below which the line search must not ask for a decrease
-BLURRED = 1e-6  # relative rise of an energy that may be rounding, if the slope along the step falls to
 SHORT = 2  # halvings of a line search that tell that the matrix lacks curvature there
+BLURRED = 1e-6  # relative rise of an energy that may be rounding, if the slope along the step falls to
 FLATTER = 0.5  # this share at least: slopes are good to more digits (Hager and Zhang, SIAM J. Optim. 16 (2005) 170).
 
 
@@ -52,7 +52,7 @@ class NewtonOptions:
     stall_iterations: iterations that do not halve the residual after which a step is given up as well; None: none
     contact_curvature: whether the matrix always has what contact adds by its curvature. That jumps where points come to
         edges: where bodies slide over edges there are a fifth fewer iterations without; then only the iteration after a
-        line search of `SHORT` halvings has it, as where edges of fingers rest on each other nothing converges without
+        line search of `SHORT` halvings has it, as where edges of fingers rest on each other Newton crawls without
     max_friction_updates: how often the friction bounds are renewed within a step
     friction_tolerance: share of the friction bounds that may change without a renewal
     linear_solver, preconditioner, backend: see `finqd.mechanics.linear`
