@@ -15,6 +15,7 @@ from finqd.scene import SoftBody
 MARGIN = 20.0  # gaps that faces may come closer before their list is made anew
 STALE = 25  # looks at a list that may have been in vain, after which it is made anew
 WORTH = 0.1  # of the margin that bodies must have moved for that
+FAR = 0.25  # of the margin beyond the gap from which on a rough bound of faces' distance will do
 ROUNDING = 1e-9  # [m] of a distance that does not count as free way, as ways are added up
 NONE = np.zeros((0, 2), dtype=np.int64)  # pairs of faces
 NOTCH = 2.0  # gaps that faces of one body are apart at rest, at least, for them to touch each other
@@ -70,7 +71,7 @@ class Triangulation:
 class _Watch:
     """Pairs of faces of one body, or of two, that were near at ``reference`` (n_vertices, 3).
 
-    gaps: lower bound of the distance that each of them had there [m], (n,); near: the faces of these pairs
+    gaps: lower bound of the distance that each of them had there [m], (n,)
     seen: positions that were asked for last; moved, remaining: how much nearer any faces may have come there since [m],
     and the lower bounds that remain (n,)
     looks: at pairs on the list that may be nearer than the gap, since it was made
@@ -83,7 +84,6 @@ class _Watch:
     reference: np.ndarray | None = None
     listed: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     gaps: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    near: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     seen: np.ndarray | None = None
     moved: float = 0.0
     remaining: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -254,7 +254,6 @@ class NearFaces:
         if watch.reference is None or stale or not self._moved(positions, watch) <= self.margin:
             watch.reference, watch.seen, watch.looks = positions, None, 0
             watch.listed, watch.gaps = self.pairs(positions, watch, self.gap + self.margin)
-            watch.near = np.unique(watch.listed)
 
     def _joined(self, listed: list[np.ndarray]) -> np.ndarray:
         listed = [pairs for pairs in listed if len(pairs)]
@@ -269,8 +268,8 @@ class NearFaces:
             watch.seen = positions
             watch.remaining = np.empty(len(watch.listed))
             watch.moved = gaps_left(
-                positions, watch.reference, self.spans, *watch.bodies, self._moves, self.faces, watch.near,
-                watch.listed, watch.gaps, watch.remaining,
+                positions, watch.reference, self.spans, *watch.bodies, self._moves,
+                self.gap + FAR * self.margin, self.faces, watch.listed, watch.gaps, watch.remaining,
             )
         return watch.moved
 

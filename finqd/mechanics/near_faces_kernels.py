@@ -136,16 +136,21 @@ def relative_moves(positions, reference, first, end, rigid, moves):
 
 
 @njit(cache=True)
-def remaining_gaps(moves, faces, ids, listed, gaps, out):
-    """Write a lower bound of the distance of each pair ``listed`` (n, 2); ``gaps`` (n,): one before ``moves``.
+def remaining_gaps(moves, way, enough, faces, listed, gaps, out):
+    """Write a lower bound of the distance [m] of each pair ``listed`` (n, 2); ``gaps`` (n,): one before ``moves``.
 
-    ids: of all faces that are listed, or more; the bound is that of `relative_way`.
+    The bound is that of `relative_way`; or ``way`` [m], by which any two points have come nearer at most, is taken off
+    where that leaves ``enough`` [m]: most listed faces are far, or have a wall between them.
     """
-    mean, spread = np.empty((faces.shape[0], 3)), np.empty(faces.shape[0])
-    for f in ids:
-        mean[f, 0], mean[f, 1], mean[f, 2], spread[f] = mean_move(moves, faces[f])
+    mean, spread = np.empty((faces.shape[0], 3)), np.full(faces.shape[0], -1.0)
     for p in range(listed.shape[0]):
+        if gaps[p] - way >= enough:
+            out[p] = gaps[p] - way
+            continue
         a, b = listed[p, 0], listed[p, 1]
+        for f in (a, b):
+            if spread[f] == -1.0:
+                mean[f, 0], mean[f, 1], mean[f, 2], spread[f] = mean_move(moves, faces[f])
         way2 = 0.0
         for i in range(3):
             way2 += (mean[a, i] - mean[b, i]) ** 2
@@ -153,7 +158,7 @@ def remaining_gaps(moves, faces, ids, listed, gaps, out):
 
 
 @njit(cache=True)
-def gaps_left(positions, reference, spans, one, other, moves, faces, ids, listed, gaps, out):
+def gaps_left(positions, reference, spans, one, other, moves, enough, faces, listed, gaps, out):
     """Write the `remaining_gaps` of the faces of two bodies, or of one; return how much nearer any may have come [m].
 
     The arguments are those of `relative_moves`, with the vertices of bodies from ``spans`` (n_bodies, 2), and of
@@ -165,5 +170,5 @@ def gaps_left(positions, reference, spans, one, other, moves, faces, ids, listed
         way = 2.0 * way
     else:
         way += relative_moves(positions, reference, spans[other, 0], spans[other, 1], alone, moves)
-    remaining_gaps(moves, faces, ids, listed, gaps, out)
+    remaining_gaps(moves, way, enough, faces, listed, gaps, out)
     return way

@@ -155,36 +155,26 @@ def faces_gap(positions, a, b, enough):
     ``enough``: a bound that is as good as any larger one; the axes are those of the world, both normals and the line
     between the middles.
     """
-    axes = np.zeros((3, 3))
-    best = -np.inf
+    best, middle = -np.inf, (0.0, 0.0, 0.0)
     for i in range(3):
-        low_a, high_a, low_b, high_b, mid_a, mid_b = np.inf, -np.inf, np.inf, -np.inf, 0.0, 0.0
-        n_a, n_b = 0, 0
-        for k in range(a.shape[0]):
-            if a[k] >= 0:
-                x = positions[a[k], i]
-                low_a, high_a, mid_a, n_a = min(low_a, x), max(high_a, x), mid_a + x, n_a + 1
-            if b[k] >= 0:
-                x = positions[b[k], i]
-                low_b, high_b, mid_b, n_b = min(low_b, x), max(high_b, x), mid_b + x, n_b + 1
+        low_a, high_a, mid_a = _span(positions, a, i)
+        low_b, high_b, mid_b = _span(positions, b, i)
         best = max(best, low_b - high_a, low_a - high_b)
-        axes[2, i] = mid_b / n_b - mid_a / n_a
+        middle = (middle[1], middle[2], mid_b - mid_a)
     if best >= enough:
         return best
-    _normal(positions, a, axes[0])
-    _normal(positions, b, axes[1])
-    for axis in axes:
+    return _gap_along(positions, a, b, _normal(positions, a), _normal(positions, b), middle, best, enough)
+
+
+@njit(cache=True)
+def _gap_along(positions, a, b, normal_a, normal_b, middle, best, enough):
+    """Return ``best`` [m], or what separates two faces along one of three axes (three numbers), if that is more."""
+    for axis in (normal_a, normal_b, middle):
         length = math.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
         if length == 0.0:
             continue
-        low_a, high_a, low_b, high_b = np.inf, -np.inf, np.inf, -np.inf
-        for k in range(a.shape[0]):
-            if a[k] >= 0:
-                x = _along(positions, a[k], axis)
-                low_a, high_a = min(low_a, x), max(high_a, x)
-            if b[k] >= 0:
-                x = _along(positions, b[k], axis)
-                low_b, high_b = min(low_b, x), max(high_b, x)
+        low_a, high_a = _span_along(positions, a, axis)
+        low_b, high_b = _span_along(positions, b, axis)
         best = max(best, (low_b - high_a) / length, (low_a - high_b) / length)
         if best >= enough:
             return best
@@ -192,21 +182,41 @@ def faces_gap(positions, a, b, enough):
 
 
 @njit(cache=True)
-def _along(positions, vertex, axis):
-    return positions[vertex, 0] * axis[0] + positions[vertex, 1] * axis[1] + positions[vertex, 2] * axis[2]
+def _span(positions, nodes, i):
+    """Return the least, the largest and the mean coordinate i of a face's vertices [m]."""
+    low, high, mid, n = np.inf, -np.inf, 0.0, 0
+    for v in nodes:
+        if v < 0:
+            break
+        x = positions[v, i]
+        low, high, mid, n = min(low, x), max(high, x), mid + x, n + 1
+    return low, high, mid / n
 
 
 @njit(cache=True)
-def _normal(positions, nodes, normal):
-    """Write a normal of a face, of any length: the cross product of its diagonals, or of two sides of a triangle."""
+def _span_along(positions, nodes, axis):
+    """Return the least and the largest product of a face's vertices with ``axis`` (three numbers)."""
+    low, high = np.inf, -np.inf
+    for v in nodes:
+        if v < 0:
+            break
+        x = positions[v, 0] * axis[0] + positions[v, 1] * axis[1] + positions[v, 2] * axis[2]
+        low, high = min(low, x), max(high, x)
+    return low, high
+
+
+@njit(cache=True)
+def _normal(positions, nodes):
+    """Return a normal of a face, of any length: the cross product of its diagonals, or of two sides of a triangle."""
     n = 0
     while n < nodes.shape[0] and nodes[n] >= 0:
         n += 1
     quad = n == 4 or n == 8
     i, j = (nodes[0], nodes[2]) if quad else (nodes[0], nodes[1])
     k, m = (nodes[1], nodes[3]) if quad else (nodes[0], nodes[2])
-    u, v = positions[j] - positions[i], positions[m] - positions[k]
-    normal[0], normal[1], normal[2] = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+    u0, u1, u2 = positions[j, 0] - positions[i, 0], positions[j, 1] - positions[i, 1], positions[j, 2] - positions[i, 2]
+    v0, v1, v2 = positions[m, 0] - positions[k, 0], positions[m, 1] - positions[k, 1], positions[m, 2] - positions[k, 2]
+    return u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
 
 
 @njit(cache=True)
@@ -243,28 +253,38 @@ def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out
     ids (n,): of the faces looked at; side (n,): only pairs of different sides count, or all if every side is 0
     apart: keys (lower id times n_faces plus higher id, ascending) of pairs that never count; pairs that share a vertex
     do not either. out (m, 2), out_gap (m,): lower bound of their distance now; pairs beyond the end are counted, not
-    written. Sweep along x: Ericson 2005, 7.5.
+    written. Sweep along the axis on which the faces are spread out most: Ericson 2005, 7.5.
     """
     n = ids.shape[0]
-    low, high = np.empty((n, 3)), np.empty((n, 3))
+    low, high, middle, normal = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     mixed = False
     for i in range(n):
-        face_box(positions, faces[ids[i]], low[i], high[i])
-        if moving:
-            _sweep_box(direction, positions, faces[ids[i]], low[i], high[i])
+        nodes = faces[ids[i]]
+        for axis in range(3):
+            low[i, axis], high[i, axis], middle[i, axis] = _span(positions, nodes, axis)
+        normal[i, 0], normal[i, 1], normal[i, 2] = _normal(positions, nodes)
         mixed = mixed or side[i] != 0
-    order, count = np.argsort(low[:, 0]), 0
+    still_low, still_high = low, high
+    mean, spread = np.empty((n if moving else 0, 3)), np.empty(n if moving else 0)
+    if moving:
+        low, high = low.copy(), high.copy()
+        for i in range(n):
+            _sweep_box(direction, positions, faces[ids[i]], low[i], high[i])
+            mean[i, 0], mean[i, 1], mean[i, 2], spread[i] = mean_move(direction, faces[ids[i]])
+    along = _widest_axis(low)
+    second, third = (along + 1) % 3, (along + 2) % 3
+    order, count = np.argsort(low[:, along]), 0
     for k in range(n):
         i = order[k]
         for m in range(k + 1, n):
             j = order[m]
-            if low[j, 0] > high[i, 0] + reach:
+            if low[j, along] > high[i, along] + reach:
                 break
             if mixed and side[i] == side[j]:
                 continue
-            if low[j, 1] > high[i, 1] + reach or low[i, 1] > high[j, 1] + reach:
+            if low[j, second] > high[i, second] + reach or low[i, second] > high[j, second] + reach:
                 continue
-            if low[j, 2] > high[i, 2] + reach or low[i, 2] > high[j, 2] + reach:
+            if low[j, third] > high[i, third] + reach or low[i, third] > high[j, third] + reach:
                 continue
             a, b = min(ids[i], ids[j]), max(ids[i], ids[j])
             if not mixed and _share_vertex(faces[a], faces[b]):
@@ -274,14 +294,41 @@ def near_pairs(positions, direction, moving, faces, ids, side, reach, apart, out
                 at = np.searchsorted(apart, key)
                 if at < apart.shape[0] and apart[at] == key:
                     continue
-            least = reach + (relative_way(direction, faces[a], faces[b]) if moving else 0.0)
-            gap = faces_gap(positions, faces[a], faces[b], least)
+            least = reach
+            if moving:  # by a bound of how far any point of one face moves relative to any of the other
+                off = mean[i, 0] - mean[j, 0], mean[i, 1] - mean[j, 1], mean[i, 2] - mean[j, 2]
+                least += math.sqrt(off[0] ** 2 + off[1] ** 2 + off[2] ** 2) + spread[i] + spread[j]
+            gap = -np.inf
+            for x in range(3):
+                gap = max(gap, still_low[j, x] - still_high[i, x], still_low[i, x] - still_high[j, x])
+            if gap < least:
+                between = middle[j, 0] - middle[i, 0], middle[j, 1] - middle[i, 1], middle[j, 2] - middle[i, 2]
+                gap = _gap_along(positions, faces[ids[i]], faces[ids[j]], _row(normal, i), _row(normal, j), between,
+                                 gap, least)
             if gap >= least:
                 continue
             if count < out.shape[0]:
                 out[count, 0], out[count, 1], out_gap[count] = a, b, gap
             count += 1
     return count
+
+
+@njit(cache=True)
+def _row(rows, i):
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@njit(cache=True)
+def _widest_axis(low):
+    """Return the axis along which the corners ``low`` (n, 3) of boxes are spread out most."""
+    widest, most = 0, -1.0
+    for axis in range(3):
+        least, largest = np.inf, -np.inf
+        for i in range(low.shape[0]):
+            least, largest = min(least, low[i, axis]), max(largest, low[i, axis])
+        if largest - least > most:
+            widest, most = axis, largest - least
+    return widest
 
 
 @njit(cache=True)
