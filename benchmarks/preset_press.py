@@ -1,12 +1,13 @@
 """How far off are the presets on other fingers? The press on the first finger of Sobol designs, against a finer mesh.
 
-    python benchmarks/preset_press.py --log benchmarks/preset_press.jsonl [--report] [--bands]
+    python benchmarks/preset_press.py --log benchmarks/preset_press.jsonl [--finger 2] [--report] [--bands]
 
 The ladder (`finqd accuracy press`) judges presets by one finger, on which errors may cancel by luck. Here every preset
 presses the first finger of the ten designs of `verdict_flips.py`, and each force is compared with that of `YARDSTICK`,
 a mesh of quadratic bricks whose own error is told by the benchmark finger, of which the converged force is known.
 Writes a line a press as it goes, and resumes from there. ``--bands`` writes the 90 % quantile of the errors to
-studies/presets.json, which every result then carries.
+studies/presets.json, which every result then carries. ``--finger 2`` (3) presses another finger of the same designs:
+a preset whose mesh was chosen by the first ones is judged by those.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from finqd.study_log import append_row, read_rows
 from finqd.verification.press import REFERENCE, press_finger
 from finqd.workers import TaskFailure, run_tasks
 
-YARDSTICK = "yardstick"
+YARDSTICK, BENCHMARK = "yardstick", "benchmark"
 #: settings of the yardstick over the preset `standard`
 SETTINGS = {"mesher.size_mm": 1.5, "mesher.layers": 3, "mesher.least_edges": 3, "mesher.grading": 2.0}
 QUANTILE = 90  # what a band means by an error: 90 % of fingers are nearer than that
@@ -45,10 +46,17 @@ def applied(design: Design, level: str) -> Design:
     return apply_preset(design, level)
 
 
-def press(task: tuple[str, str, Design]) -> Row:
+def cases(finger: int) -> dict[str, Design]:
+    """Return the designs by the name that rows have; the benchmark's fingers are all the same."""
+    if finger == 0:
+        return designs()
+    return {f"{name}, finger {finger + 1}": design for name, design in designs().items() if name != BENCHMARK}
+
+
+def press(task: tuple[str, str, Design, int]) -> Row:
     """Press one finger; return a row of the log."""
-    name, level, design = task
-    found = press_finger(design, wall_clock_limit=LIMIT_S)
+    name, level, design, finger = task
+    found = press_finger(design, finger=finger, wall_clock_limit=LIMIT_S)
     ok = found.status == "ok"
     return {
         "design": name, "level": level, "digest": design.digest(), "status": found.status, "reason": found.reason,
@@ -56,10 +64,11 @@ def press(task: tuple[str, str, Design]) -> Row:
     }
 
 
-def run(log: Path, levels: list[str], *, jobs: int, report: bool) -> dict[tuple[str, str], Row]:
+def run(log: Path, levels: list[str], *, finger: int, jobs: int, report: bool) -> dict[tuple[str, str], Row]:
     """Press what the log does not hold yet; return all rows by design and level."""
-    tasks = [(name, level, applied(design, level)) for name, design in designs().items() for level in levels]
-    wanted = {(name, level): design.digest() for name, level, design in tasks}
+    chosen = cases(finger)
+    tasks = [(name, level, applied(design, level), finger) for name, design in chosen.items() for level in levels]
+    wanted = {(name, level): design.digest() for name, level, design, _ in tasks}
     logged = {(row["design"], row["level"]): row for row in read_rows(log)}
     rows = {key: row for key, row in logged.items() if row["digest"] == wanted.get(key)}
     todo = [task for task in tasks if task[:2] not in rows]
@@ -81,14 +90,14 @@ def errors(rows: dict[tuple[str, str], Row], level: str) -> dict[str, float]:
     found = {}
     for (name, one), row in rows.items():
         exact = rows.get((name, YARDSTICK), {}).get("force_N")
-        if one == level and name != "benchmark" and exact and row["force_N"]:
+        if one == level and name != BENCHMARK and exact and row["force_N"]:
             found[name] = 100.0 * (row["force_N"] / exact - 1.0)
     return found
 
 
 def report_rows(rows: dict[tuple[str, str], Row], levels: list[str]) -> None:
     """Print the error of every finger by level, and their quantiles."""
-    known = rows.get(("benchmark", YARDSTICK))
+    known = rows.get((BENCHMARK, YARDSTICK))
     if known is not None and known["status"] == "ok":
         off = 100.0 * (known["force_N"] / REFERENCE - 1.0)
         print(f"{YARDSTICK} on the benchmark finger: {known['force_N']:.4f} N, {off:+.2f} % off the converged force")
@@ -111,7 +120,7 @@ def write_bands(rows: dict[tuple[str, str], Row], levels: list[str]) -> None:
     document["studies"]["press_fingers"] |= {"date": time.strftime("%Y-%m-%d"), "versions": versions()}
     for level in levels[1:]:
         found = np.abs(list(errors(rows, level).values()))
-        row, band = rows["benchmark", level], document["presets"][level]
+        row, band = rows[BENCHMARK, level], document["presets"][level]
         if band["settings"] != PRESETS[level]:  # a preset that has changed since `preset_bands.py` wrote its row
             off = 100.0 * abs(row["force_N"] / REFERENCE - 1.0)
             band |= {"press_force_error_percent": round(off, 2), "settings": PRESETS[level]}
@@ -124,6 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--log", type=Path, required=True)
     parser.add_argument("--presets", default="draft,standard,fine,reference", help="paper too, if need be")
+    parser.add_argument("--finger", type=int, choices=(1, 2, 3), default=1, help="of each design")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--report", action="store_true", help="only print what the log holds")
     parser.add_argument("--bands", action="store_true", help="write the errors into studies/presets.json")
@@ -132,7 +142,9 @@ def main() -> None:
     if not set(chosen) <= set(PRESETS):
         parser.error(f"--presets: known are {', '.join(PRESETS)}")
     levels = [YARDSTICK, *chosen]
-    rows = run(arguments.log, levels, jobs=arguments.jobs, report=arguments.report)
+    if arguments.bands and arguments.finger != 1:
+        parser.error("--bands are those of the first fingers")
+    rows = run(arguments.log, levels, finger=arguments.finger - 1, jobs=arguments.jobs, report=arguments.report)
     report_rows(rows, levels)
     if arguments.bands:
         if any(len(errors(rows, level)) < len(designs()) - 1 for level in chosen):
