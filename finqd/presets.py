@@ -26,9 +26,9 @@ DEFAULT = "standard"
 #: the press by far
 _QUARTER: dict[str, Any] = {"order": 2, "notch_nodes": "quarter"}
 
-#: Linear bricks, one across the finger: too soft across it, and too stiff beside notches, which cancels at this size:
-#: ten presses are 3.2 % off in the median, 6 % at 3 and 2.4 % at 2 mm. Half as many unknowns as quadratic bricks of 4 mm,
-#: which were 6.2 % off; a grasp takes a quarter to a third of the time
+#: Linear bricks, one across the finger: too soft across it, and too stiff beside notches, which cancels at this size.
+#: Ten presses are off by 3.2 % in the median and by less than 5.7 % in nine (at 3 mm 5.3 and 12.4 %, at 2 mm 2.4 and
+#: 7.6 %; quadratic bricks of 4 mm, with twice as many unknowns and three to four times the time, 6.2 and 11.9 %)
 _THIN: dict[str, Any] = {"size_mm": 2.5, "layers": 1}
 
 #: solved to 1 mN at 5 N; steps that stall are better halved (counted on four grasps with `draft`)

@@ -311,24 +311,24 @@ class _Pardiso:
         self.parameters[17] = -1  # report the entries of the factor
         self.parameters[27] = int(rows.values.dtype == np.float32)  # single precision
         self.parameters[34] = 1  # indices from zero
-        self._arguments = (self._handle, self.parameters, rows)
+        self._call = _Call(self._handle, self.parameters, rows)
         self._release: weakref.finalize | None = None
 
     def factorise(self) -> bool:
         """Factorise the current values of the rows; False if a pivot has the wrong sign or is zero."""
         if self._release is None:
-            self._release = weakref.finalize(self, _call_pardiso, -1, *self._arguments)
-            _check(_call_pardiso(11, *self._arguments))
-        error = _call_pardiso(22, *self._arguments)
+            self._release = weakref.finalize(self, self._call, -1)
+            _check(self._call(11))
+        error = self._call(22)
         if error == -4:
             return False
         _check(error)
         return True
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        given = np.asfortranarray(rhs, dtype=self._arguments[2].values.dtype)
+        given = np.asfortranarray(rhs, dtype=self._call.dtype)
         solution = np.empty_like(given, order="F")
-        _check(_call_pardiso(33, *self._arguments, given, solution))
+        _check(self._call(33, given, solution))
         return solution.astype(float, copy=False)
 
 
@@ -337,30 +337,34 @@ def _check(error: int) -> None:
         raise np.linalg.LinAlgError(f"Pardiso failed with error {error}")
 
 
-def _call_pardiso(
-    phase: int,
-    handle: np.ndarray,
-    parameters: np.ndarray,
-    rows: Rows,
-    rhs: np.ndarray | None = None,
-    solution: np.ndarray | None = None,
-) -> int:
-    """Run one phase of MKL's ``pardiso`` and return its error code."""
+class _Call:
+    """A call of MKL's ``pardiso`` with one matrix: what all its phases are given is made ready once."""
 
-    def pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:
-        return None if array is None else ctypes.c_void_p(array.ctypes.data)
+    def __init__(self, handle: np.ndarray, parameters: np.ndarray, rows: Rows) -> None:
+        self.dtype = rows.values.dtype
+        self._arrays = (handle, parameters, rows.values, rows.indptr, rows.indices)  # what is pointed to must stay
+        self._pointers = tuple(_pointer(array) for array in self._arrays)
+        self._numbers = {value: _integer(value) for value in (0, 1, _POSITIVE, rows.size)}
+        self._size = rows.size
 
-    def integer(value: int) -> Any:
-        return ctypes.byref(ctypes.c_int32(value))
+    def __call__(self, phase: int, rhs: np.ndarray | None = None, solution: np.ndarray | None = None) -> int:
+        """Run one phase and return its error code."""
+        handle, parameters, values, indptr, indices = self._pointers
+        number, error = self._numbers, ctypes.c_int32(0)
+        columns = number[1] if rhs is None or rhs.ndim == 1 else _integer(rhs.shape[1])
+        _mkl().pardiso(
+            handle, number[1], number[1], number[_POSITIVE], _integer(phase), number[self._size], values, indptr,
+            indices, None, columns, parameters, number[0], _pointer(rhs), _pointer(solution), ctypes.byref(error),
+        )
+        return error.value
 
-    error = ctypes.c_int32(0)
-    columns = 1 if rhs is None or rhs.ndim == 1 else rhs.shape[1]
-    _mkl().pardiso(
-        pointer(handle), integer(1), integer(1), integer(_POSITIVE), integer(phase), integer(rows.size),
-        pointer(rows.values), pointer(rows.indptr), pointer(rows.indices), None, integer(columns),
-        pointer(parameters), integer(0), pointer(rhs), pointer(solution), ctypes.byref(error),
-    )  # fmt: skip
-    return error.value
+
+def _pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:
+    return None if array is None else ctypes.c_void_p(array.ctypes.data)
+
+
+def _integer(value: int) -> Any:
+    return ctypes.byref(ctypes.c_int32(value))
 
 
 @functools.cache

@@ -16,6 +16,7 @@ from finqd.mechanics.contact_pairs import ContactPairs
 from finqd.mechanics.contact_rows import FrictionBounds, FrictionRows, KeyedValues, Rows
 from finqd.mechanics.contact_surface import ContactSurface, Sight, contact_surface
 from finqd.mechanics.mass_properties import thickness
+from finqd.mechanics.near_faces_kernels import longest_move
 from finqd.mechanics.pattern import BlockPattern
 from finqd.mechanics.reach import Reach, met_by_soft
 from finqd.mechanics.rotation_kernels import inverse_left_jacobian, rotation_vector
@@ -236,10 +237,13 @@ class PenaltyContact:
     def step_limit(self, state: State, direction: Direction) -> float:
         """Return the largest share (0, 1] of ``direction`` in which no point sinks too far into anything."""
         allowance, limit = self.options.step_allowance_mm * MM, 1.0
-        farthest = float(np.sqrt(np.max(np.sum(direction.soft**2, axis=1), initial=0.0)))
+        hard = SUPPORT_ALLOWANCE * self.options.weight_penetration_mm * MM
+        farthest = longest_move(direction.soft, 0, len(direction.soft))
+        ways = []  # that any point of a rigid body goes at most
         for r, body in enumerate(self.scene.rigid_bodies):
             shift, turn = np.linalg.norm(direction.rigid[r, :3]), np.linalg.norm(direction.rigid[r, 3:])
-            if r not in self.met or farthest + shift + turn * body.shape.bounding_radius <= allowance:
+            ways.append(shift + turn * body.shape.bounding_radius)
+            if r not in self.met or farthest + ways[r] <= allowance:
                 continue
             limit = min(
                 limit,
@@ -249,16 +253,15 @@ class PenaltyContact:
                 ),
             )
         for p, plane in enumerate(self.scene.planes):
-            if p in self.planes:
+            if p in self.planes and not farthest <= allowance:  # takes a NaN too
                 heights = (state.positions - plane.point) @ plane.normal
                 limit = min(limit, kernels.plane_step_limit(heights, -direction.soft @ plane.normal, allowance))
             for r, body in enumerate(self.scene.rigid_bodies):
-                if not self.scene.touches(body.name, plane.name):
+                if ways[r] <= hard or not self.scene.touches(body.name, plane.name):
                     continue
                 arms = _support_arms(body.shape, state.rigid_rotations[r], plane.normal)
                 moves = direction.rigid[r, :3] + np.cross(direction.rigid[r, 3:], arms)
                 heights = (state.rigid_positions[r] + arms - plane.point) @ plane.normal
-                hard = SUPPORT_ALLOWANCE * self.options.weight_penetration_mm * MM
                 limit = min(limit, kernels.plane_step_limit(heights, -moves @ plane.normal, hard))
         return limit if self.soft is None else self.soft.step_limit(state, direction, limit)
 
