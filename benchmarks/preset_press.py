@@ -123,7 +123,8 @@ def write_bands(rows: dict[tuple[str, str], Row], levels: list[str]) -> None:
         row, band = rows[BENCHMARK, level], document["presets"][level]
         if band["settings"] != PRESETS[level]:  # a preset that has changed since `preset_bands.py` wrote its row
             off = 100.0 * abs(row["force_N"] / REFERENCE - 1.0)
-            band |= {"press_force_error_percent": round(off, 2), "settings": PRESETS[level]}
+            band |= {"press_force_error_percent": round(off, 2), "press_seconds": round(row["seconds"], 2),
+                     "settings": PRESETS[level]}  # fmt: skip
         band |= {"press_fingers_error_percent": round(float(np.percentile(found, QUANTILE)), 2)}
     write_whole(path, json.dumps(document, indent=2) + "\n")
 
