@@ -107,6 +107,13 @@ def _estimate_line(estimate: Mapping[str, Any]) -> str:
     return f"error estimate: {uncertain}; simulated for: {seconds}"
 
 
+#: what the column of seconds means
+COSTS = (
+    "cost: seconds in kernels and the Python round them; one figure together for object_contact, friction and floor, "
+    "for self_contact and finger_to_finger_contact, and for the elements; what has no kernels of its own has none"
+)
+
+
 def print_explanation(name: str, row: Mapping[str, Any]) -> None:
     """Print the effects of one grasp (`finqd.explain.Explanation.to_dict`), a row each, and what came of it.
 
@@ -118,12 +125,13 @@ def print_explanation(name: str, row: Mapping[str, Any]) -> None:
         console.print(escape(row["reason"]), soft_wrap=True)
     asked = any("what_if" in line for line in row["effects"].values())
     more = ("what if", "held", "force [%]>", "drop [mm]>", "seconds>") if asked else ("why",)
-    table = _table("effect", "", "since [s]>", *more)
+    table = _table("effect", "", "since [s]>", "cost [s]>", *more)
     for effect, line in row["effects"].items():
         other = line.get("what_if", {})
         cells = _changes(row, other) if asked else [escape(line["why"])]
-        table.add_row(effect, line["state"], _number(line["since_s"], 2), *cells)
+        table.add_row(effect, line["state"], _number(line["since_s"], 2), _number(line["seconds"], 2), *cells)
     console.print(table)
+    console.print(escape(COSTS), soft_wrap=True)
     for effect, line in row["effects"].items():
         if line.get("what_if", {}).get("reason"):
             console.print(escape(f"{effect} {line['what_if']['reason']}"), soft_wrap=True)

@@ -15,6 +15,7 @@ from finqd.errors import InputError
 from finqd.evaluate import finger_meshes, load_objects, run_grasps
 from finqd.grasp import GraspTask
 from finqd.presets import apply_preset
+from finqd.profiling import effect_seconds
 from finqd.units import MM
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ class Line:
     """One effect in one grasp.
 
     state: "on" or "off"; why: one sentence; since: when it was needed first [s], None if it never was or is not known
+    seconds: what it cost; effects that the same kernels look after have one figure together. None where it is off,
+        was never needed, or has no kernels of its own
     other: the state of the grasp ``what_if`` with the other one, where that was simulated, or why it cannot be
     """
 
@@ -64,12 +67,15 @@ class Line:
     state: str
     why: str
     since: float | None = None
+    seconds: float | None = None
     other: str = ""
     what_if: Outcome | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON holds it."""
-        row: dict[str, Any] = {"state": self.state, "since_s": self.since, "why": self.why}
+        row: dict[str, Any] = {
+            "state": self.state, "since_s": self.since, "seconds": self.seconds, "why": self.why,
+        }
         if self.what_if is not None:
             row["what_if"] = {"state": self.other, **self.what_if.to_dict()}
         elif self.other:
@@ -110,7 +116,7 @@ def explain(
     tasks, labels = [], []
     for thing in grasped:
         for name, other in (("", chosen), *_changed(others, thing)):
-            tasks.append(GraspTask(design=other, meshes=meshes, grasped=thing))
+            tasks.append(GraspTask(design=other, meshes=meshes, grasped=thing, profile=True))
             labels.append(f"{thing.name}, {name} {other.forced_effects[name]}" if name else thing.name)
     found = iter(run_grasps(tasks, labels=labels, jobs=jobs, progress=progress))
     return [
@@ -144,6 +150,7 @@ def _explanation(
 ) -> Explanation:
     changed = _changed(others, thing)
     outcomes = {name: Outcome.of(other, thing.name, run) for (name, other), run in zip(changed, rest, strict=True)}
+    seconds = {name: cost for names, cost in effect_seconds(base.timings).items() for name in names}
     lines = []
     for name, sentence in effects_of(design).items():
         state, why = ("on" if _is_on(sentence) else "off"), sentence.partition(": ")[2] or sentence
@@ -157,6 +164,7 @@ def _explanation(
         useless = name == "soft_object" and thing.soft is None
         lines.append(Line(
             name=name, state=state, why=why, since=since if state == "on" else None,
+            seconds=seconds.get(name) if state == "on" and since is not None else None,
             other="" if useless else other if isinstance(other, str) else other.forced_effects[name],
             what_if=None if useless else outcomes.get(name),
         ))

@@ -52,6 +52,11 @@ KERNELS = (
 WHOLE = ("set_up", "recording", "early_verdict")
 #: what is in `KERNELS` as well and could be spared: rejected steps, and trials of line searches after the first one
 AVOIDABLE = ("rejected_steps", "line_search_trials")
+#: what is in `KERNELS` as well, whatever its category: contact of soft bodies with each other and themselves
+SOFT = "soft_contact"
+SOFT_METHODS = (
+    "find", "energy", "add_gradient", "add_hessian", "couplings", "bind", "step_limit", "lag", "bounds", "mapped_slips",
+)
 UNAVOIDABLE = (
     "what iterations of accepted steps spend in kernels and libraries, with one trial each; avoidable are rejected "
     "steps, further trials of line searches, counted at the mean cost of a gradient, and rest"
@@ -196,6 +201,7 @@ class Profile:
     def __init__(self) -> None:
         self.clock = Clock()
         self.avoidable = {name: [0.0, 0] for name in AVOIDABLE}
+        self._soft, self._within = [0.0, 0], False
         self._gradient_seconds, self._gradients, self._before = 0.0, 0, 0.0
         self._replaced: list[tuple[Any, str, Any]] = []
         self._solvers: dict[int, _TimedSolver] = {}
@@ -226,6 +232,7 @@ class Profile:
             for name, category in methods.items():
                 self.replace(owner, name, clock.timed(getattr(owner, name), category))
         self._watch_search(system.contact)
+        self._watch_soft(getattr(system.contact, "soft", None))
         self.replace(system, "contact", Timed(system.contact, clock, CONTACT))
         self.replace(system, "potentials", [Timed(one, clock, ELASTICITY) for one in system.potentials])
         if system.damping is not None:
@@ -243,6 +250,24 @@ class Profile:
             owner, name = (getattr(contact, first, None), second) if second else (contact, first)
             if hasattr(owner, name) and hasattr(owner, "__dict__"):
                 self.replace(owner, name, self.clock.timed(getattr(owner, name), "contact_search"))
+
+    def _watch_soft(self, soft: Any) -> None:
+        for name in SOFT_METHODS:
+            if hasattr(soft, name) and hasattr(soft, "__dict__"):
+                self.replace(soft, name, self._inside_soft(getattr(soft, name)))
+
+    def _inside_soft(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def inside(*args: Any, **kwargs: Any) -> Any:
+            if self._within:
+                return function(*args, **kwargs)
+            self._within, begun = True, time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self._within = False
+                self._soft = [self._soft[0] + time.perf_counter() - begun, self._soft[1] + 1]
+
+        return inside
 
     def _solver_of(self, solver: Callable[..., LinearSolver]) -> Callable[..., Any]:
         def inside(settings: tuple, make: Callable[[], LinearSolver]) -> Any:
@@ -286,7 +311,7 @@ class Profile:
         clock.tick()
         trials[0] = trials[1] * self._gradient_seconds / max(self._gradients, 1)
         rows = {name: (clock.seconds[name], clock.calls[name]) for name in CATEGORIES}
-        rows |= {name: tuple(row) for name, row in self.avoidable.items()}
+        rows |= {name: tuple(row) for name, row in {**self.avoidable, SOFT: self._soft}.items()}
         return {f"profile/{name}/{what}": value for name, row in rows.items()
                 for what, value in zip(("seconds", "calls"), row, strict=True)}
 
@@ -315,6 +340,25 @@ def profiled() -> Iterator[Profile]:
             yield profile
     finally:
         profile.release()
+
+
+def effect_seconds(timings: Mapping[str, float]) -> dict[tuple[str, ...], float]:
+    """Return what effects cost in a simulation that left these ``timings`` [s], kernels and the Python round them.
+
+    Effects that the same kernels look after have one figure together. Empty if no profile was asked for.
+    """
+    if "profile/rest/seconds" not in timings:
+        return {}
+
+    def seconds(start: str) -> float:
+        return sum(timings[f"profile/{name}/seconds"] for name in CATEGORIES if name.startswith(start))
+
+    soft = timings[f"profile/{SOFT}/seconds"]
+    return {
+        ("object_contact", "friction", "floor"): max(seconds("contact_") - soft, 0.0),
+        ("self_contact", "finger_to_finger_contact"): soft,
+        ("large_rotation", "material_nonlinearity"): seconds("elastic_"),
+    }
 
 
 def total(timings: Iterable[Mapping[str, float]], *, set_up: float = 0.0, mesh: float = 0.0) -> dict[str, Any]:
