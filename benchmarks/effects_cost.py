@@ -1,25 +1,32 @@
 """What does each effect cost, and what does it change? The benchmark gripper, each effect the other way round.
 
     python benchmarks/effects_cost.py --log effects_cost.jsonl [--objects sphere,cube] [--preset draft] [--report]
+        [--study]
 
 One grasp after the other, all with warm kernels; an object's round (plain, then each effect switched) is repeated, and
-seconds are medians. Writes a line an object and round as it goes, and resumes.
+seconds are medians. Writes a line an object and round as it goes, and resumes. ``--study`` writes the first round of
+each object to studies/effects.json, which the pages of `finqd accuracy` show.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
+import time
 from pathlib import Path
 from typing import Any
 
 from checkout import commit, commits
 
-from finqd.data import designs_folder
+from finqd.accuracy_effects import FILE
+from finqd.data import designs_folder, studies_folder
 from finqd.design import Design
 from finqd.explain import explain
 from finqd.objects import object_names
 from finqd.presets import PRESETS
+from finqd.provenance import versions
+from finqd.runlog import write_whole
 from finqd.study_log import append_row, read_rows
 
 
@@ -67,6 +74,17 @@ def report(rows: list[dict[str, Any]]) -> None:
             print(f"{effect:<26}{line['state']:<5}{since:>10}{ratio:>28}{held:>7}{force:>9}{drop:>11}")
 
 
+def write_study(rows: list[dict[str, Any]], preset: str) -> None:
+    """Write the first round of each object with a preset to studies/effects.json."""
+    chosen = {row["object"]: row for row in reversed(rows) if row["preset"] == preset}
+    objects = {name: chosen[name] for name in sorted(chosen)}
+    again = f"python benchmarks/effects_cost.py --log LOG --preset {preset} --objects {','.join(objects)} --study"
+    write_whole(studies_folder() / FILE, json.dumps({
+        "preset": preset, "date": time.strftime("%Y-%m-%d"), "commit": commits(list(objects.values())),
+        "versions": versions(), "repeat": again, "objects": objects,
+    }, indent=2) + "\n")  # fmt: skip
+
+
 def main() -> None:
     """Measure, then report."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -75,10 +93,14 @@ def main() -> None:
     parser.add_argument("--preset", default="draft", choices=list(PRESETS))
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--report", action="store_true", help="only print what the log holds")
+    parser.add_argument("--study", action="store_true", help="write studies/effects.json from the log")
     given = parser.parse_args()
     if not given.report:
         measure(given.log, objects=given.objects.split(","), preset=given.preset, repeat=given.repeat)
-    report(list(read_rows(given.log)))
+    rows = list(read_rows(given.log))
+    report(rows)
+    if given.study:
+        write_study(rows, given.preset)
 
 
 if __name__ == "__main__":

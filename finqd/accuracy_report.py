@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from finqd.accuracy import Row, Study, disturbed, front
+from finqd.accuracy_effects import effects_section
 from finqd.accuracy_ladder import KNOBS
 from finqd.runlog import write_whole
 
@@ -100,7 +101,7 @@ def extrapolations(study: Study) -> list[tuple[str, float, float]]:
 
 
 def page(study: Study, *, picture: bytes) -> str:
-    """Return the page: picture, front, presets, all rungs, reference, what was not run, versions and machine."""
+    """Return the page: picture, front, presets, all rungs, effects, reference, what was not run, origin."""
     rows = study.table()
     best = front(rows)
     chosen = {row["rung"] for row in best}
@@ -117,7 +118,7 @@ def page(study: Study, *, picture: bytes) -> str:
         turned = [row for row in rows if row["knob"] == knob != "preset"]
         if turned:
             parts += [f"<h2>{escape(knob)}: {escape(meaning)}</h2>", _table(study, turned, chosen)]
-    parts += [_reference(study), _extrapolated(study), _omitted(study), _origin(study, rows)]
+    parts += [effects_section(), _reference(study), _extrapolated(study), _omitted(study), _origin(study, rows)]
     title = f"finqd accuracy: {study.case.name}, {study.design.name}"
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'

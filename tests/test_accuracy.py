@@ -24,6 +24,7 @@ from finqd.accuracy import (
     outdated,
 )
 from finqd.accuracy_cases import CASES, case_options, measured
+from finqd.accuracy_effects import effects_section
 from finqd.accuracy_ladder import (
     AS_GIVEN,
     KNOBS,
@@ -552,6 +553,26 @@ def test_table_picture_and_page(study_in, tmp_path):
     words = ("The Pareto front", "--reference compute", "Not run", "order 2.00", "penetration [mm]", "Newton")
     for needed in (*words, *PRESETS, study.versions["numpy"], study.machine["processor"]):
         assert needed in text, needed
+
+
+def test_the_page_shows_what_effects_cost_and_change(monkeypatch, tmp_path):
+    monkeypatch.setattr("finqd.accuracy_effects.studies_folder", lambda: tmp_path)
+    assert effects_section() == "", "no study, no section"
+    off = {"state": "off", "status": "ok", "held": False, "drop_mm": 30.0, "force_N": 7.0, "seconds": 5.0}
+    effects = {
+        "friction": {"state": "on", "since_s": 0.5, "seconds": 1.25, "why": "", "what_if": off},
+        "damping": {"state": "off", "since_s": None, "seconds": None, "why": "", "what_if": {
+            "state": None, "reason": "cannot be forced <on>"}},
+        "soft_object": {"state": "off", "since_s": None, "seconds": None, "why": ""},
+    }
+    row = {"held": True, "drop_mm": 0.5, "force_N": 14.0, "seconds": 10.0, "effects": effects}
+    study = {"preset": "standard", "date": "2026-01-02", "commit": "abc", "repeat": "again", "objects": {"ball": row}}
+    (tmp_path / "effects.json").write_text(json.dumps(study))
+    text = re.sub(r"<[^>]*>", "|", effects_section())
+    assert "|friction||on||0.50||1.25||off: lost||-50.000||+29.5000||0.50|" in text
+    assert "|damping||off||-||-||cannot be forced &lt;on&gt;||-||-||-|" in text
+    assert "|soft object||off||-||-||-||" in text
+    assert "ball: held, drop 0.50 mm, force 14.00 N, 10.0 s" in text and "commit abc" in text
 
 
 def test_labels_of_presets_cover_neither_stars_nor_each_other():
