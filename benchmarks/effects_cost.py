@@ -74,13 +74,14 @@ def report(rows: list[dict[str, Any]]) -> None:
             print(f"{effect:<26}{line['state']:<5}{since:>10}{ratio:>28}{held:>7}{force:>9}{drop:>11}")
 
 
-def write_study(rows: list[dict[str, Any]], preset: str) -> None:
+def write_study(rows: list[dict[str, Any]], preset: str, conditions: str) -> None:
     """Write the first round of each object with a preset to studies/effects.json."""
     chosen = {row["object"]: row for row in reversed(rows) if row["preset"] == preset}
     objects = {name: chosen[name] for name in sorted(chosen)}
     again = f"python benchmarks/effects_cost.py --log LOG --preset {preset} --objects {','.join(objects)} --study"
     write_whole(studies_folder() / FILE, json.dumps({
         "preset": preset, "date": time.strftime("%Y-%m-%d"), "commit": commits(list(objects.values())),
+        "conditions": conditions,
         "versions": versions(), "repeat": again, "objects": objects,
     }, indent=2) + "\n")  # fmt: skip
 
@@ -94,13 +95,14 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--report", action="store_true", help="only print what the log holds")
     parser.add_argument("--study", action="store_true", help="write studies/effects.json from the log")
+    parser.add_argument("--conditions", default="one grasp after the other, warm", help="of the study, in words")
     given = parser.parse_args()
     if not given.report:
         measure(given.log, objects=given.objects.split(","), preset=given.preset, repeat=given.repeat)
     rows = list(read_rows(given.log))
     report(rows)
     if given.study:
-        write_study(rows, given.preset)
+        write_study(rows, given.preset, given.conditions)
 
 
 if __name__ == "__main__":

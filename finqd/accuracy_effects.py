@@ -14,7 +14,7 @@ from finqd.data import studies_folder
 from finqd.json_input import read_json_object
 
 FILE = "effects.json"
-COLUMNS = ("effect", "", "since [s]", "cost [s]", "the other way round", "force [%]", "drop [mm]", "seconds")
+COLUMNS = ("effect", "", "since [s]", "cost [s]", "the other way round", "force [%]", "drop [mm]", "time [factor]")
 COST = (
     "Cost: seconds in kernels and the Python round them; one figure together for object contact, friction and floor, "
     "for self-contact and finger-to-finger contact, and for the elements. The rest: what changes if the effect alone "
@@ -29,7 +29,8 @@ def effects_section() -> str:
         return ""
     study, _ = read_json_object(path, kind="study")
     title = f"Effects: the benchmark gripper, {study['preset']}"
-    told = f"{study['date']}, commit {study['commit']}, one grasp after the other, warm. To repeat it: "
+    when = f"{study['date']}, {study['commit']}, {study['conditions']}"
+    told = f"{when}. To repeat it: "
     parts = [f"<h2>{escape(title)}</h2><p>{escape(COST)} {escape(told)}<code>{escape(study['repeat'])}</code></p>"]
     for name, row in study["objects"].items():
         verdict = "held" if row["held"] else "lost"

@@ -566,13 +566,14 @@ def test_the_page_shows_what_effects_cost_and_change(monkeypatch, tmp_path):
         "soft_object": {"state": "off", "since_s": None, "seconds": None, "why": ""},
     }
     row = {"held": True, "drop_mm": 0.5, "force_N": 14.0, "seconds": 10.0, "effects": effects}
-    study = {"preset": "standard", "date": "2026-01-02", "commit": "abc", "repeat": "again", "objects": {"ball": row}}
+    study = {"preset": "standard", "date": "2026-01-02", "commit": "abc", "conditions": "warm",
+             "repeat": "again", "objects": {"ball": row}}
     (tmp_path / "effects.json").write_text(json.dumps(study))
     text = re.sub(r"<[^>]*>", "|", effects_section())
     assert "|friction||on||0.50||1.25||off: lost||-50.000||+29.5000||0.50|" in text
     assert "|damping||off||-||-||cannot be forced &lt;on&gt;||-||-||-|" in text
     assert "|soft object||off||-||-||-||" in text
-    assert "ball: held, drop 0.50 mm, force 14.00 N, 10.0 s" in text and "commit abc" in text
+    assert "ball: held, drop 0.50 mm, force 14.00 N, 10.0 s" in text and "abc, warm" in text
 
 
 def test_labels_of_presets_cover_neither_stars_nor_each_other():
